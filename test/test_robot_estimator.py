@@ -268,6 +268,7 @@ def test_derivatives_of_the_filter_are_those_of_its_equations():
         z, sd = other.update(1, 5.0, 0.01, True)
         return -z * sd
 
+    one.state.normalise()
     x = one.state.x.copy()
     one.update(1, 5.0, 0.01, True)
     H = np.array([(residual(x + step * e) - residual(x - step * e)) / (2 * step) for e in np.eye(n)])

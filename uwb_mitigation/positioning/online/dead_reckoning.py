@@ -36,6 +36,9 @@ MAX_SPEED, MAX_YAW_RATE = 50.0, 50.0
 JUMP_SPEED, JUMP_YAW_RATE = 3.0, 10.0
 """If the pose of the odometry moves by this much faster than its twist, it was reset: the twist is used (m/s, rad/s)."""
 
+_SLIP, _TURN_NOISE = 2.0 * CORRELATION_S * MOTION_SHARE**2, 2.0 * CORRELATION_S * TURN_SHARE**2
+"""Variance per second of random errors: of the position for the squared velocity, of the yaw for the squared yaw rate."""
+
 _MAX_VARIANCE = 1e3
 _NUM_SAMPLES = 512
 
@@ -117,43 +120,43 @@ class DeadReckoning:
         if not (speed <= MAX_SPEED and abs(yaw_rate) <= MAX_YAW_RATE):
             self.rejected += 1
             return
-        if pose is not None and not all(map(math.isfinite, pose)):
+        # A sum is finite if its terms are.
+        if pose is not None and not math.isfinite(pose[0] + pose[1] + pose[2]):
             pose = None
         last = self._samples[-1] if self._samples else None
         gap_ns = 0 if last is None else stamp_ns - last.stamp_ns
         if last is not None and -NS_PER_S <= gap_ns <= 0:
             self.rejected += 1
             return
-        imu_yaw = self._yaw_of_imu(stamp_ns)
+        imu_yaw = None if self._imu is None else _yaw_of_imu(stamp_ns, self._imu)
         if last is None or not 0 < gap_ns <= ODOMETRY_TIMEOUT_S * NS_PER_S:
             self._segment += 1
             self._samples.clear()
             self._samples.append(_Sample(stamp_ns, PathPoint(self._segment), (0.0,) * 8, pose))
             self._imu_yaw, self.twist = imu_yaw, None
             return
-        dt = gap_ns / NS_PER_S
+        dt, before = gap_ns / NS_PER_S, last.point
         if pose is not None and last.pose is not None:
-            vx, vy, yaw_rate = _twist_of_poses(last.pose, pose, dt, (vx, vy, yaw_rate))
+            vx, vy, yaw_rate = _twist_of_poses(last.pose, pose, dt, twist)
             speed = math.hypot(vx, vy)
-        of_speed = _known_variance(max(twist_variance[:2]), SPEED_SD)
-        of_yaw_rate = _known_variance(twist_variance[2], YAW_RATE_SD)
+        of_x, of_y, of_yaw_rate = twist_variance
+        of_speed = _known_variance(max(of_x, of_y), SPEED_SD)
+        of_yaw_rate = _known_variance(of_yaw_rate, YAW_RATE_SD)
         drift, turn_sd = WHEEL_DRIFT * speed, WHEEL_TURN
-        slip_density = 2.0 * CORRELATION_S * MOTION_SHARE**2
-        yaw_density = of_yaw_rate * dt + 2.0 * CORRELATION_S * TURN_SHARE**2 * yaw_rate**2
-        source = last.point.source + last.point.source % 2
+        yaw_density = of_yaw_rate * dt + _TURN_NOISE * yaw_rate * yaw_rate
+        source = before.source + before.source % 2
         if imu_yaw is not None and self._imu_yaw is not None and self._imu is not None:
             yaw_rate, of_yaw_rate = (imu_yaw - self._imu_yaw) / dt, self._imu[2]
             drift, turn_sd, yaw_density = GYRO_DRIFT, GYRO_TURN, of_yaw_rate * dt
-            source = last.point.source | 1
+            source = before.source | 1
         self._imu_yaw = imu_yaw
         self.twist, self.twist_variance = (vx, vy, yaw_rate), (of_speed, of_yaw_rate)
-        middle = last.point.yaw + 0.5 * yaw_rate * dt
+        middle = before.yaw + 0.5 * yaw_rate * dt
         cosine, sine = math.cos(middle), math.sin(middle)
-        position_density = of_speed * dt + slip_density * speed**2
-        velocity = (cosine * vx - sine * vy, sine * vx + cosine * vy, yaw_rate)
-        rates = (*velocity, speed, drift, turn_sd * yaw_rate, position_density, yaw_density)
-        point = _moved(last.point, rates, dt)._replace(source=source)
-        self._samples.append(_Sample(stamp_ns, point, rates, pose))
+        east, north = cosine * vx - sine * vy, sine * vx + cosine * vy
+        position_density = of_speed * dt + _SLIP * speed * speed
+        rates = (east, north, yaw_rate, speed, drift, turn_sd * yaw_rate, position_density, yaw_density)
+        self._samples.append(_Sample(stamp_ns, _moved(before, rates, dt, source), rates, pose))
 
     def add_imu(self, stamp_ns: int, yaw_rate: float, variance: float = 0.0, yaw: float = math.nan) -> None:
         """Add a message of an IMU; an invalid one is rejected.
@@ -182,7 +185,10 @@ class DeadReckoning:
     def point_at(self, stamp_ns: int) -> PathPoint | None:
         """Return the path at a time, by interpolation, or by extrapolation of the latest motion; None: unknown."""
         latest = self._before(stamp_ns)
-        return None if latest is None else _moved(latest[0].point, latest[1], latest[2])
+        if latest is None:
+            return None
+        (_, point, _, _), rates, dt = latest
+        return _moved(point, rates, dt, point.source)
 
     def pose_at(self, stamp_ns: int) -> tuple[float, float, float] | None:
         """Return x, y and yaw in the frame of the odometry at a time; None: unknown, or messages without a pose."""
@@ -211,12 +217,11 @@ class DeadReckoning:
             rates = sample.rates
         return None
 
-    def _yaw_of_imu(self, stamp_ns: int) -> float | None:
-        if self._imu is None:
-            return None
-        at_ns, rate, _, yaw, _ = self._imu
-        dt = (stamp_ns - at_ns) / NS_PER_S
-        return yaw + rate * dt if abs(dt) <= IMU_TIMEOUT_S else None
+
+def _yaw_of_imu(stamp_ns: int, imu: tuple[int, float, float, float, float]) -> float | None:
+    at_ns, rate, _, yaw, _ = imu
+    dt = (stamp_ns - at_ns) / NS_PER_S
+    return yaw + rate * dt if abs(dt) <= IMU_TIMEOUT_S else None
 
 
 def _known_variance(variance: float, default_sd: float) -> float:
@@ -224,24 +229,34 @@ def _known_variance(variance: float, default_sd: float) -> float:
 
 
 def _twist_of_poses(
-    before: Sequence[float], after: Sequence[float], dt: float, twist: tuple[float, float, float]
+    before: Sequence[float], after: Sequence[float], dt: float, twist: Sequence[float]
 ) -> tuple[float, float, float]:
     """Return the mean twist between two poses, or `twist` of the message if the poses jump."""
-    dyaw = math.remainder(after[2] - before[2], math.tau)
+    (x, y, yaw), (end_x, end_y, end_yaw), (vx, vy, yaw_rate) = before, after, twist
+    turned = math.remainder(end_yaw - yaw, math.tau)
     # In the axes halfway between both.
-    middle = before[2] + 0.5 * dyaw
-    east, north = after[0] - before[0], after[1] - before[1]
+    middle, east, north = yaw + 0.5 * turned, end_x - x, end_y - y
     cosine, sine = math.cos(middle), math.sin(middle)
-    dx, dy = cosine * east + sine * north, cosine * north - sine * east
-    speed, yaw_rate = math.hypot(dx, dy) / dt, abs(dyaw) / dt
+    speed_limit, yaw_rate_limit = 2.0 * math.hypot(vx, vy) + JUMP_SPEED, 2.0 * abs(yaw_rate) + JUMP_YAW_RATE
     # False for NaN.
-    is_continuous = (
-        speed <= 2.0 * math.hypot(*twist[:2]) + JUMP_SPEED and yaw_rate <= 2.0 * abs(twist[2]) + JUMP_YAW_RATE
+    if math.hypot(east, north) <= speed_limit * dt and abs(turned) <= yaw_rate_limit * dt:
+        return (cosine * east + sine * north) / dt, (cosine * north - sine * east) / dt, turned / dt
+    return vx, vy, yaw_rate
+
+
+def _moved(point: PathPoint, rates: tuple[float, ...], dt: float, source: int) -> PathPoint:
+    """Return the point after a time with constant rates of its values."""
+    segment, x, y, yaw, distance_m, drift, turn, position_variance, yaw_variance, _ = point
+    east, north, yaw_rate, speed, of_drift, of_turn, of_position, of_yaw = rates
+    return PathPoint(
+        segment,
+        x + east * dt,
+        y + north * dt,
+        yaw + yaw_rate * dt,
+        distance_m + speed * dt,
+        drift + of_drift * dt,
+        turn + of_turn * dt,
+        position_variance + of_position * dt,
+        yaw_variance + of_yaw * dt,
+        source,
     )
-    return (dx / dt, dy / dt, dyaw / dt) if is_continuous else twist
-
-
-def _moved(point: PathPoint, rates: tuple[float, ...], dt: float) -> PathPoint:
-    segment, *values, source = point
-    moved = [value + rate * dt for value, rate in zip(values, rates, strict=True)]
-    return PathPoint._make([segment, *moved, source])

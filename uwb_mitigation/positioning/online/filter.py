@@ -21,6 +21,8 @@ from uwb_mitigation.types.tracks import Estimate
 OFFSET = 6
 FIRST_ERROR = 7
 
+_IDENTITY = np.eye(3, 6)
+
 
 class RangeFilter:
     """Filter of the position and velocity of a tag.
@@ -40,7 +42,7 @@ class RangeFilter:
         unseen: float64 (3, 3), m^2, covariance of the position for what the state does not contain: constant errors, other solutions.
     """
 
-    __slots__ = ("_anchors", "_model", "_views", "is_level", "state", "time_s", "unseen")
+    __slots__ = ("_anchors", "_model", "is_level", "state", "time_s", "unseen")
 
     def __init__(
         self,
@@ -52,27 +54,30 @@ class RangeFilter:
         *,
         level: bool = False,
     ) -> None:
-        self._anchors, self._model, self.is_level, self.time_s = anchors.position, model, level, time_s
+        # Python numbers are faster than NumPy for the vector to an anchor.
+        self._anchors: list[list[float]] = anchors.position.tolist()
+        self._model, self.is_level, self.time_s = model, level, time_s
         self.state = RobustUpdate(anchors, model, np.concatenate([position, np.zeros(3)]))
-        self._views: tuple[NDArray[np.float64], ...] = ()
-        self.P[:3, :3], self.unseen = covariance, np.zeros((3, 3))
+        self.state.P[:3, :3], self.unseen = covariance, np.zeros((3, 3))
         for axis in range(2 if level else 3):
-            self.P[3 + axis, 3 + axis] = model.speed**2
+            self.state.P[3 + axis, 3 + axis] = model.speed**2
 
     @property
     def x(self) -> NDArray[np.float64]:
         """State, float64 (n,)."""
+        self.state.normalise()
         return self.state.x
 
     @property
     def P(self) -> NDArray[np.float64]:
         """Covariance of the state, float64 (n, n)."""
+        self.state.normalise()
         return self.state.P
 
     def copy(self) -> RangeFilter:
         """Return an independent copy."""
         twin = copy.copy(self)
-        twin.state, twin._views = self.state.copy(), ()
+        twin.state = self.state.copy()
         return twin
 
     def predict(self, time_s: float) -> None:
@@ -81,36 +86,24 @@ class RangeFilter:
         if dt <= 0.0:
             return
         self.time_s = time_s
-        x, P = self.state.x, self.state.P
-        if not self._views or self._views[0].base is not x:
-            # They are made once: new ones would take much of the time.
-            positions, velocities = slice(2 if self.is_level else 3), slice(3, 5 if self.is_level else 6)
-            self._views = (
-                *(x[:3], x[3:6], P[:3], P[3:6], P[:, :3], P[:, 3:6]),
-                *(
-                    np.einsum("ii->i", P[i, j])
-                    for i in (positions, velocities)
-                    for j in (positions, velocities)
-                ),
-            )
-        x, v, x_rows, v_rows, x_columns, v_columns, xx, xv, vx, vv = self._views
-        x += dt * v
-        x_rows += dt * v_rows
-        x_columns += dt * v_columns
+        x, P, F = self.state.x, self.state.P, _IDENTITY.copy()
+        F[0, 3] = F[1, 4] = F[2, 5] = dt
+        x[:3] = F.dot(x[:6])
+        P[:3] = F.dot(P[:6])
+        P[:, :3] = P[:, :6].dot(F.T)
+        n, axes, q = len(x), 2 if self.is_level else 3, self._model.acceleration**2 * dt
+        cross, variances = q * dt / 2.0, P.reshape(-1)
+        for first, noise in ((0, q * dt * dt / 3.0), (3, cross), (3 * n, cross), (3 * n + 3, q)):
+            diagonal = variances[first : first + axes * (n + 1) : n + 1]
+            diagonal += noise
         self.state.predict_errors(dt / self._model.persistence_s)
-        q = self._model.acceleration**2 * dt
-        cross = q * dt / 2.0
-        xx += q * dt * dt / 3.0
-        xv += cross
-        vx += cross
-        vv += q
 
     def update(
         self, anchor: int, range_m: float, variance_m2: float, is_corrected: bool
     ) -> tuple[float, float]:
         """Update with a finite range at the time of the state; see `RobustUpdate.update_range`."""
         # Python numbers are faster here than NumPy.
-        state, (u, v, w) = self.state, self._anchors[anchor].tolist()
+        state, (u, v, w) = self.state, self._anchors[anchor]
         x, y, z = state.x[:3].tolist()
         x, y, z = x - u, y - v, z - w
         distance = math.sqrt(x * x + y * y + z * z)
@@ -120,39 +113,42 @@ class RangeFilter:
 
     def update_height(self, height_m: float, variance_m2: float) -> tuple[float, float]:
         """Update with the height of the tag; return as `RobustUpdate.update_range`."""
-        H = np.zeros(len(self.x))
+        H = np.zeros(len(self.state.x))
         H[2] = 1.0
-        return self.state.update(H, height_m - float(self.x[2]), variance_m2, robust=False)
+        return self.state.update(H, height_m - self.state.x.item(2), variance_m2, robust=False)
 
     def confine(self, low: Sequence[float], high: Sequence[float]) -> None:
         """Project the position onto a box."""
         # This runs after each update. Python numbers are faster here than NumPy scalars.
-        x0, x1, x2 = self.x[:3].tolist()
+        x = self.state.x
+        x0, x1, x2 = x[:3].tolist()
         if low[0] <= x0 <= high[0] and low[1] <= x1 <= high[1] and low[2] <= x2 <= high[2]:
             return
         for axis in range(3):
-            nearest = min(max(float(self.x[axis]), low[axis]), high[axis])
-            if nearest != self.x[axis]:
+            nearest = min(max(x.item(axis), low[axis]), high[axis])
+            if nearest != x[axis]:
                 self.state.project(axis, nearest)
-        self.x[:3] = np.clip(self.x[:3], low, high)
+        x[:3] = np.clip(x[:3], low, high)
 
     def reflect(self, mirror: Symmetry) -> None:
         """Replace position and velocity by their mirror images."""
         reflection = np.eye(3) - 2.0 * np.multiply.outer(mirror.axis, mirror.axis)
-        self.x[:3] = mirror.images(self.x[:3])[0]
-        self.x[3:6] = reflection @ self.x[3:6]
+        x, P = self.state.x, self.state.P
+        x[:3] = mirror.images(x[:3])[0]
+        x[3:6] = reflection @ x[3:6]
         for rows in (slice(3), slice(3, 6)):
-            self.P[rows] = reflection @ self.P[rows]
-            self.P[:, rows] = self.P[:, rows] @ reflection
+            P[rows] = reflection @ P[rows]
+            P[:, rows] = P[:, rows] @ reflection
 
     def estimate(self, stamp_ns: int) -> Estimate:
         """Return position and velocity, at the stamp that the state is for."""
         state = self.state
-        x, covariance = state.x, state.P[:6, :6] * state.covariance_scale()
+        x, covariance = state.x, state.P[:6, :6].copy()
+        covariance *= state.covariance_scale()
         covariance[:3, :3] += self.unseen
         return Estimate(stamp_ns, x[:3].copy(), x[3:6].copy(), covariance)
 
     @property
     def position(self) -> NDArray[np.float64]:
         """Float64 (3,), m."""
-        return self.x[:3]
+        return self.state.x[:3]

@@ -8,6 +8,7 @@ of the heading contains a turn that the odometry does not show yet.
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections import deque
 from typing import NamedTuple
@@ -34,7 +35,6 @@ class _Fault(NamedTuple):
 _FAULTS = (_Fault(), _Fault(gain=-1.0), _Fault(gain=-2.0, sign=-1.0), _Fault(delay_s=1.0))
 """None; velocities in the axes of the world, whose relation to the heading is unknown; yaw rates with the wrong sign; late stamps."""
 
-_GAINS, _SIGNS = np.array([[fault.gain, fault.sign] for fault in _FAULTS]).T
 _MAX_DELAY_S = max(fault.delay_s for fault in _FAULTS)
 
 IDENTIFIED, EXCLUDED, MOST_EVIDENCE = -2.0, 2.5, 15.0
@@ -85,13 +85,13 @@ class HeadingTest:
 
     def __init__(self, lever_arm: tuple[float, float, float], *, is_verified: bool = False) -> None:
         self._arm = complex(*lever_arm[:2])
-        self._evidence = np.full(len(_FAULTS) - 1, is_verified * EXCLUDED)
+        self._evidence = [is_verified * EXCLUDED] * (len(_FAULTS) - 1)
         self._slowest, self._fastest = math.inf, -math.inf
         self._turned, self.contradicts = (0.0, PathPoint(0)), False
         # Time, distance driven, variance, drift and turn of the odometry, position, and position relative to the start of the path for each fault.
         self._samples: deque[tuple[complex, ...]] = deque(maxlen=400)
         self._last: PathPoint | None = None
-        self._path = np.zeros(len(_FAULTS), complex)
+        self._path = [0j] * len(_FAULTS)
         self._fitted_m, self._variance, self._drift = 0.0, math.inf, 0.0
         self._rotation: float | None = None
 
@@ -128,12 +128,18 @@ class HeadingTest:
         if last is None:
             self._fitted_m = point.distance_m
         else:
-            step = complex(point.x - last.x, point.y - last.y)
-            self._path = self._path + step * np.exp(0.5j * _GAINS * (point.yaw + last.yaw))
+            step, middle = complex(point.x - last.x, point.y - last.y), 0.5 * (point.yaw + last.yaw)
+            self._path = [
+                place + step * cmath.rect(1.0, fault.gain * middle)
+                for place, fault in zip(self._path, _FAULTS, strict=True)
+            ]
         self._last = point
-        antenna = self._path + self._arm * np.exp(1j * _SIGNS * point.yaw)
+        antenna = [
+            place + self._arm * cmath.rect(1.0, fault.sign * point.yaw)
+            for place, fault in zip(self._path, _FAULTS, strict=True)
+        ]
         self._samples.append(
-            (time_s, point.distance_m, variance, point.drift, point.turn, position, *antenna.tolist())
+            (time_s, point.distance_m, variance, point.drift, point.turn, position, *antenna)
         )
         if point.distance_m - self._fitted_m >= EVERY_M:
             self._fit()
@@ -151,9 +157,10 @@ class HeadingTest:
             return math.inf
         difference = math.remainder(self._rotation + point.yaw - yaw, math.tau)
         limit = CONTRADICTION**2 * (variance + self._variance + self._drift)
-        *others, late = self._evidence.tolist()
-        self.contradicts = min(*others, late) < IDENTIFIED or difference**2 > limit
-        if self.contradicts or min(others) < EXCLUDED or self._variance > MAX_FIT_SD**2:
+        *others, late = self._evidence
+        least = min(others)
+        self.contradicts = min(least, late) < IDENTIFIED or difference**2 > limit
+        if self.contradicts or least < EXCLUDED or self._variance > MAX_FIT_SD**2:
             return math.inf
         change = 0.0
         if late < EXCLUDED:
@@ -195,7 +202,8 @@ class HeadingTest:
         gain = driven_m * np.log((square + ERROR_M**2) / (square[0] + ERROR_M**2))
         expected = driven_m * np.log1p(distance / (np.minimum(square, square[0]) + ERROR_M**2))
         most = np.minimum(expected, MOST_OF_FIT)
-        self._evidence = np.minimum(self._evidence + np.clip(gain, -most, most)[1:], MOST_EVIDENCE)
+        evidence = self._evidence + np.clip(gain, -most, most)[1:]
+        self._evidence = np.minimum(evidence, MOST_EVIDENCE).tolist()
         self._fitted_m, self._rotation = float(distance_m[-1]), float(np.angle(rotation[0]))
         # Errors of ranges persist: averaging does not reduce the variance of the rotation.
         self._variance = float(square[0] + UNSEEN_M**2) / (2.0 * float(np.mean(np.abs(position) ** 2)))

@@ -61,7 +61,8 @@ class OdometryFilter:
         lever_arm: tuple[float, float, float],
         yaw: tuple[float, float],
     ) -> None:
-        self._anchors, self._model, self._level = anchors.position, model, start.is_level
+        self._anchors: list[list[float]] = anchors.position.tolist()
+        self._model, self._level = model, start.is_level
         self.time_s, self.point, self._lever_arm = start.time_s, point, lever_arm
         motion = np.zeros(MOTION)
         motion[:3], motion[YAW] = start.position, yaw[0]
@@ -93,17 +94,16 @@ class OdometryFilter:
             for index in (DRIFT, TURN):
                 x[index] = P[index] = P[:, index] = 0.0
                 P[index, index] = 1.0
-        _, _, _, yaw, scale, yaw_drift, yaw_turn = x[:MOTION].tolist()
+        east, north, _, yaw, scale, yaw_drift, yaw_turn = x[:MOTION].tolist()
         relative = yaw - before.yaw
         cosine, sine = math.cos(relative), math.sin(relative)
-        east, north = point.x - before.x, point.y - before.y
-        dx, dy = cosine * east - sine * north, sine * east + cosine * north
+        dx, dy = point.x - before.x, point.y - before.y
+        dx, dy = cosine * dx - sine * dy, sine * dx + cosine * dy
         distance = max(point.distance_m - before.distance_m, 0.0)
         drift, turn = point.drift - before.drift, point.turn - before.turn
         scale += 1.0
-        x[0] += scale * dx
-        x[1] += scale * dy
-        x[YAW] += point.yaw - before.yaw + drift * yaw_drift + turn * yaw_turn
+        x[0], x[1] = east + scale * dx, north + scale * dy
+        x[YAW] = yaw + point.yaw - before.yaw + drift * yaw_drift + turn * yaw_turn
         if distance or drift or turn:
             F = _IDENTITY.copy()
             F[0, YAW], F[0, SCALE], F[1, YAW], F[1, SCALE] = -scale * dy, dx, scale * dx, dy
@@ -121,7 +121,7 @@ class OdometryFilter:
     ) -> tuple[float, float]:
         """Update with a finite range at the time of the state; see `RobustUpdate.update_range`."""
         # Python numbers are faster here than NumPy.
-        state, (u, v, w) = self.state, self._anchors[anchor].tolist()
+        state, (u, v, w) = self.state, self._anchors[anchor]
         x, y, z, yaw = state.x[:SCALE].tolist()
         arm_x, arm_y = self._arm(yaw)
         x, y, z = x + arm_x - u, y + arm_y - v, z + self._lever_arm[2] - w

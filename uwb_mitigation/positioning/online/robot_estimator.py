@@ -177,12 +177,11 @@ class RobotEstimator:
         excess = 2.0 * (self._separation - EQUAL_SEPARATION)
         weight = math.exp(-self._rejections) / (1.0 + math.exp(min(excess, 50.0)))
         position, covariance = ranges_only.position, ranges_only.covariance
-        x, y, _ = heading_filter.antenna
         # Python numbers are faster here than NumPy.
-        x0, y0, _ = position.tolist()
+        (x0, y0, _), (x, y, _) = position.tolist(), heading_filter.antenna
         dx, dy = x0 - x, y0 - y
-        (a, b, to_x), (_, c, to_y) = covariance[:2, :3].tolist()
-        (u, v), (_, w) = self.tag.filter.unseen[:2, :2].tolist()
+        (a, b, to_x, *_), (_, c, to_y, *_), *_ = covariance.tolist()
+        (u, v, _), (_, w, _), _ = self.tag.filter.unseen.tolist()
         xx, xy, yy, x_yaw, y_yaw, yaw_variance = heading_filter.published_covariance()
         of_mean = weight * (1.0 - CONSTANT_SHARE)
         rest, apart = 1.0 - of_mean, weight * (1.0 - weight)
@@ -218,36 +217,39 @@ class RobotEstimator:
             self._start_yaws(point)
             return
         dt = time_s - self._yaws[0].filter.time_s
-        height = None if tag.filter is None else (tag.filter.x.item(2), tag.filter.P.item(2, 2))
+        height = None if tag.filter is None else (tag.filter.state.x.item(2), tag.filter.state.P.item(2, 2))
         for hypothesis in self._yaws:
-            hypothesis.filter.advance(time_s, point)
+            filter_ = hypothesis.filter
+            filter_.advance(time_s, point)
             if height is not None:
-                hypothesis.filter.set_height(*height)
-            z, sd = hypothesis.filter.update(*measurement[1:])
+                filter_.set_height(*height)
+            z, sd = filter_.update(*measurement[1:])
             if self._area is not None:
-                hypothesis.filter.confine(self._area)
-            hypothesis.loss += self._config.model.student_loss(z) + math.log(sd)
-        self._prune()
+                filter_.confine(self._area)
+            if self._heading_filter is None:
+                hypothesis.loss += self._config.model.student_loss(z) + math.log(sd)
+        if self._heading_filter is None:
+            self._prune()
         if tag.filter is None:
             self._test.forget_positions()
             return
         if self._test.is_due(time_s, point):
-            (x, y), (a, b) = tag.filter.x[:2].tolist(), tag.filter.P.diagonal()[:2].tolist()
-            self._test.add(time_s, complex(x, y), 0.5 * (a + b) * tag.filter.state.covariance_scale(), point)
+            state = tag.filter.state
+            variance = 0.5 * (state.P.item(0, 0) + state.P.item(1, 1)) * state.covariance_scale()
+            self._test.add(time_s, complex(*state.x[:2].tolist()), variance, point)
         if self._heading_filter is not None:
             self._update_separation(self._heading_filter, dt)
 
     def _update_separation(self, heading_filter: OdometryFilter, dt: float) -> None:
-        filter_ = self.tag.filter
-        assert filter_ is not None
-        x, y, _ = heading_filter.antenna
-        dx, dy = x - filter_.x.item(0), y - filter_.x.item(1)
-        (a, b), (_, c) = filter_.P[:2, :2].tolist()
+        assert self.tag.filter is not None
+        state, (x, y, _) = self.tag.filter.state, heading_filter.antenna
+        dx, dy = x - state.x.item(0), y - state.x.item(1)
+        a, b, c = state.P.item(0, 0), state.P.item(0, 1), state.P.item(1, 1)
         separation = (c * dx * dx - 2.0 * b * dx * dy + a * dy * dy) / max(a * c - b * b, 1e-12)
         self._separation += min(max(dt, 0.0) / SEPARATION_S, 1.0) * (separation - self._separation)
         self._rejections *= math.exp(-max(dt, 0.0) / FORGIVEN_S)
         # Large range errors move the ranges-only solution away from correct odometry, too.
-        scale = max(filter_.state.covariance_scale(), 1.0)
+        scale = max(state.covariance_scale(), 1.0)
         if self._separation < VERIFIED_SEPARATION * scale:
             self._is_rejected = False
         if self._separation > REJECTED_SEPARATION * scale:

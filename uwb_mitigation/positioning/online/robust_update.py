@@ -51,6 +51,9 @@ this value two. On held-out layouts both have six of eighty."""
 RESIDUAL_RATE = 0.001
 """As `CONSISTENCY_RATE`, for products of residuals: a thousand ranges, because most of their errors are constant."""
 
+MIN_UNIT, MAX_ELAPSED = 1e-3, 100.0
+"""Limits of `RobustUpdate.error_unit`, and of the time constants of one prediction."""
+
 PRIOR_SHARE = 0.05
 """Weight of the modelled variance of persisting errors among these: that of ranges of which this share is redundant."""
 
@@ -64,7 +67,9 @@ class RobustUpdate:
         motion: initial values of the k motion states; their covariance is zero.
 
     Attributes:
-        x, P: state float64 (n,) and its covariance (n, n).
+        x, P: state float64 (n,) and its covariance (n, n). Persisting errors are in units of `error_unit`, and their variances lack the
+            noise since the anchor's latest range: so a prediction does not change their rows and columns. See `normalise`.
+        error_unit: decays with the persisting errors, m.
         H: float64 (n,), derivatives of the next range with respect to the motion states, which the owner sets.
         estimates_errors: whether measurements change offset and errors, which are only considered otherwise.
         consistency: running mean of the second moments of the persisting errors, relative to the model; 1: they are as modelled.
@@ -75,7 +80,9 @@ class RobustUpdate:
         self._model, self._offset = model, len(motion)
         n = len(motion) + 1 + len(anchors)
         # The unconditional variance of each anchor's persisting error: what its last ranges' variances claim.
-        self._error_variance = (1.0 - model.white) * model.range_sd**2 + anchors.sd**2
+        self._error_variance = ((1.0 - model.white) * model.range_sd**2 + anchors.sd**2).tolist()
+        # The inverse square of the unit at each anchor's latest range.
+        self.error_unit, self._noise_until = 1.0, [1.0] * len(anchors)
         self.estimates_errors, self.consistency = False, 1.0
         self.residual_square, self._last_residual = 0.0, [0.0] * len(anchors)
         self._constant_rows: dict[int, int] = {}
@@ -84,25 +91,17 @@ class RobustUpdate:
         self.P[self._offset, self._offset] = model.offset_sd**2
         errors = np.arange(self._offset + 1, n)
         self.P[errors, errors] = self._error_variance
-        self._bind()
-
-    def _bind(self) -> None:
-        """Set views of the errors in state and covariance: new ones for every prediction would take much of its time."""
-        x, P, n, first = self.x, self.P, len(self.x), self._offset + 1
-        end = first + len(self._error_variance)
-        variances = P.reshape(-1)[first * (n + 1) : end * n : n + 1]
-        self._errors = x[first:end], P[first:end], P[:, first:end], variances
 
     def copy(self) -> RobustUpdate:
         """Return an independent copy."""
         twin = copy.copy(self)
-        for name in ("H", "P", "_constant_rows", "_error_variance", "_last_residual", "x"):
+        for name in ("H", "P", "_constant_rows", "_error_variance", "_last_residual", "_noise_until", "x"):
             setattr(twin, name, getattr(self, name).copy())
-        twin._bind()
         return twin
 
     def replace_motion(self, motion: NDArray[np.float64]) -> RobustUpdate:
         """Return a state with other motion states (k,), the same errors, and the covariance of position and errors."""
+        self.normalise()
         twin, k, old = self.copy(), len(motion), self._offset
         twin._offset = k
         twin.x = np.concatenate([motion, self.x[old:]])
@@ -112,7 +111,6 @@ class RobustUpdate:
         before = np.r_[0:3, old : len(self.x)]
         twin.P[np.ix_(retained, retained)] = self.P[np.ix_(before, before)]
         twin._constant_rows = {anchor: row + k - old for anchor, row in self._constant_rows.items()}
-        twin._bind()
         return twin
 
     def _constant_row(self, anchor: int) -> int:
@@ -124,7 +122,6 @@ class RobustUpdate:
             size = min(MAX_CONSTANT, len(self._error_variance))
             self.x, self.H = np.pad(self.x, (0, size)), np.pad(self.H, (0, size))
             self.P = np.pad(self.P, (0, size))
-            self._bind()
         x, P = self.x, self.P
         free = self._offset + 1 + len(self._error_variance) + len(rows)
         row = free if free < len(x) else rows.pop(next(iter(rows)))
@@ -135,11 +132,22 @@ class RobustUpdate:
 
     def predict_errors(self, elapsed: float) -> None:
         """Predict the persisting errors after `elapsed` time constants."""
-        decay, (x, rows, columns, variances) = math.exp(-elapsed), self._errors
-        x *= decay
-        rows *= decay
-        columns *= decay
-        variances += (1.0 - decay * decay) * self._error_variance
+        self.error_unit *= math.exp(-min(elapsed, MAX_ELAPSED))
+        if self.error_unit < MIN_UNIT:
+            self.normalise()
+
+    def normalise(self) -> None:
+        """Convert the persisting errors in `x` and `P` to metres, with their noise."""
+        unit, first = self.error_unit, self._offset + 1
+        if unit == 1.0:
+            return
+        errors = slice(first, first + len(self._error_variance))
+        noise = np.array(self._error_variance) * (unit**-2 - np.array(self._noise_until))
+        self.x[errors] *= unit
+        np.einsum("ii->i", self.P[errors, errors])[:] += noise
+        self.P[errors] *= unit
+        self.P[:, errors] *= unit
+        self.error_unit, self._noise_until = 1.0, [1.0] * len(self._error_variance)
 
     def update_range(
         self, anchor: int, range_m: float, distance_m: float, variance_m2: float, is_corrected: bool
@@ -159,7 +167,11 @@ class RobustUpdate:
         constant = self._constant_row(anchor) if is_corrected else 0
         model, x, H, P, k = self._model, self.x, self.H, self.P, self._offset
         row = k + 1 + anchor
-        variance, error_variance = model.variance(variance_m2), self._error_variance.item(anchor)
+        variance, error_variance = model.variance(variance_m2), self._error_variance[anchor]
+        unit = self.error_unit
+        noise_until = 1.0 / (unit * unit)
+        P[row, row] += error_variance * (noise_until - self._noise_until[anchor])
+        self._noise_until[anchor] = noise_until
         # The part of the variance that the persisting error does not explain is white noise.
         white_share = CORRECTED_WHITE if is_corrected else model.white
         white = max(white_share * variance, variance - error_variance)
@@ -167,9 +179,9 @@ class RobustUpdate:
             (1.0 - white_share) * variance - error_variance
         )
         H[k:] = 0.0
-        H[k] = H[row] = 1.0
+        H[k], H[row] = 1.0, unit
         residual = range_m - distance_m - x.item(k)
-        innovation = residual - x.item(row)
+        innovation = residual - unit * x.item(row)
         if is_corrected:
             H[constant] = 1.0
             innovation -= x.item(constant)
@@ -183,7 +195,7 @@ class RobustUpdate:
         square = residual * self._last_residual[anchor]
         self._last_residual[anchor] = residual
         self.residual_square += RESIDUAL_RATE * (square - self.residual_square)
-        ratio = (x.item(row) ** 2 + P.item(row, row)) / error_variance
+        ratio = (x.item(row) ** 2 + P.item(row, row)) / (noise_until * error_variance)
         self.consistency += CONSISTENCY_RATE * (min(ratio, MAX_RATIO) - self.consistency)
         return z, sd
 
@@ -223,7 +235,7 @@ class RobustUpdate:
     @property
     def modelled_variance(self) -> float:
         """Mean variance of the persisting errors in the model, m^2."""
-        return float(np.add.reduce(self._error_variance)) / len(self._error_variance)
+        return sum(self._error_variance) / len(self._error_variance)
 
     def persisting_variance(self, redundancy: float) -> float:
         """Return the variance of the errors that do not average out, m^2, for the share of redundant ranges."""
