@@ -87,7 +87,7 @@ class AmbiguityCheck:
     @property
     def is_ambiguous(self) -> bool:
         """Whether positions with another x and y explain the ranges."""
-        return self.ambiguity in (Ambiguity.MIRROR, Ambiguity.CIRCLE)
+        return self.ambiguity is Ambiguity.MIRROR or self.ambiguity is Ambiguity.CIRCLE
 
     def compare(self, filter_: RangeFilter, measurement: TagRange, num_anchors: int) -> bool:
         """Average how much better the position explains the ranges than its image; return whether both were swapped.
@@ -140,7 +140,8 @@ class AmbiguityCheck:
         gain, redundancy = constant_error_gain(anchors, position, dims, self._model.offset_sd)
         variance = state.persisting_variance(redundancy)
         excess = FEW_ANCHORS * max(variance - state.modelled_variance, 0.0)
-        filter_.unseen = self._widens * (excess * gain + state.hidden_offset_covariance())
+        constant = max(excess, state.constant_variance)
+        filter_.unseen = self._widens * (constant * gain + state.hidden_offset_covariance())
         sd_m, scale = math.sqrt(max(FEW_ANCHORS * variance, RANGE_ERROR_M**2)), state.covariance_scale()
         self.error_sd_m = sd_m
         offset_sd_m = math.sqrt(float(state.P[OFFSET, OFFSET]))

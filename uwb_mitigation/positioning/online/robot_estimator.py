@@ -127,7 +127,7 @@ class RobotEstimator:
         while self._recorded and self._recorded[0][0] <= measurement.stamp_ns:
             recorded_ns, add, values = self._recorded.popleft()
             add(recorded_ns, *values)
-        estimate = self.tag.add(measurement)
+        estimate = self.tag.add_range(measurement)
         self._update_headings(measurement)
         if estimate is None or self._heading_filter is None:
             return estimate

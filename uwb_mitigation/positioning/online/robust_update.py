@@ -29,7 +29,8 @@ CORRECTED_WHITE = 0.6
 """As `NoiseModel.white`, for ranges whose constant error is a state."""
 
 CONSTANT_SD = 0.07
-"""Standard deviation of the constant error of an anchor's corrected ranges, m: antenna delay, position, reflections."""
+"""Standard deviation of the constant error of an anchor, m: antenna delay, position, reflections. A state for corrected ranges; for
+raw ones a part of the published covariance."""
 
 MAX_CONSTANT = 16
 """With more anchors, the one whose constant error has been estimated for longest is forgotten: the state remains small."""
@@ -236,6 +237,11 @@ class RobustUpdate:
     def modelled_variance(self) -> float:
         """Mean variance of the persisting errors in the model, m^2."""
         return sum(self._error_variance) / len(self._error_variance)
+
+    @property
+    def constant_variance(self) -> float:
+        """Variance of constant errors that are not states, m^2."""
+        return 0.0 if self._constant_rows else CONSTANT_SD**2
 
     def persisting_variance(self, redundancy: float) -> float:
         """Return the variance of the errors that do not average out, m^2, for the share of redundant ranges."""

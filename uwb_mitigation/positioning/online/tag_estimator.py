@@ -151,6 +151,10 @@ class TagEstimator:
         if isinstance(measurement, TagHeight):
             self._add_height(measurement)
             return None
+        return self.add_range(measurement)
+
+    def add_range(self, measurement: TagRange) -> Estimate | None:
+        """Update with a valid range; see `add`."""
         stamp_ns, anchor, range_m, variance_m2, _ = measurement
         time_s = self.seconds(stamp_ns)
         if time_s < self._time_s:
@@ -175,7 +179,7 @@ class TagEstimator:
             self._search(measurement)
         else:
             self._follow(self.filter, measurement)
-        if self.filter is None or self.is_ambiguous:
+        if self.filter is None or self.images.is_ambiguous:
             return None
         return self._estimate(self.filter, stamp_ns)
 
@@ -289,7 +293,8 @@ class TagEstimator:
         """Return the estimate of a filter for publication, with the known height and a covariance that contains images."""
         estimate = filter_.estimate(stamp_ns)
         covariance, position = estimate.covariance, estimate.position
-        position += self.images.shift
+        if self.images.mirror is not None:
+            position += self.images.shift
         if self._height is not None:
             # Constant errors of ranges would move it in the filter.
             position[2] = self._height.value
