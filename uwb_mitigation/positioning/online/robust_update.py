@@ -81,7 +81,7 @@ class RobustUpdate:
         self._model, self._offset = model, len(motion)
         n = len(motion) + 1 + len(anchors)
         # The unconditional variance of each anchor's persisting error: what its last ranges' variances claim.
-        self._error_variance = ((1.0 - model.white) * model.range_sd**2 + anchors.sd**2).tolist()
+        self._error_variance: list[float] = ((1.0 - model.white) * model.range_sd**2 + anchors.sd**2).tolist()
         # The inverse square of the unit at each anchor's latest range.
         self.error_unit, self._noise_until = 1.0, [1.0] * len(anchors)
         self.estimates_errors, self.consistency = False, 1.0
