@@ -19,11 +19,29 @@ from uwb_mitigation.mitigation.model.weights import layer_inputs, sum_operands
 from uwb_mitigation.training.fit.quantisation import quantise_network
 
 
+def hostile_inputs(samples: int, seed: int) -> np.ndarray:
+    """Return plausible, flat, saturating, sparse, tiny, zero and huge windows."""
+    generator = np.random.default_rng(seed)
+    sparse = generator.random((60, samples)) * (generator.random((60, samples)) < 0.05)
+    rows = [
+        windows(200, samples, seed),
+        generator.random((60, samples)),
+        generator.random((60, samples)) * 50,
+        sparse * 20,
+        generator.random((20, samples)) * 1e-3,
+        np.zeros((1, samples)),
+        np.full((1, samples), 3e38),
+        np.tile([0.0, 1e9], (1, samples))[:, :samples],
+    ]
+    return np.concatenate(rows).astype(np.float32)
+
+
 def test_shipped_network_equals_onnx_runtime():
     shipped = load_bundle(default_model_path())
     session, reference = Session(shipped), integer_network(shipped)
     largest = reference.weights.activation_scale["input"]
-    inputs = np.concatenate([windows(1500, 157, 4), random_networks.rounding_windows(157, largest, 500)])
+    rounded = random_networks.rounding_windows(157, largest, 500)
+    inputs = np.concatenate([windows(1500, 157, 4), hostile_inputs(157, 5), rounded])
     expected = reference.predict_m(inputs)
     assert np.array_equal(session.predict_m(inputs), expected)
     single = np.concatenate([session.predict_m(row[None]) for row in inputs[-500:]])

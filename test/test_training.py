@@ -88,6 +88,11 @@ def test_network_learns_a_function_of_its_inputs():
     assert left < 0.4 * np.abs(targets - np.median(targets)).mean()
 
 
+def test_inputs_that_are_not_finite_are_refused():
+    with pytest.raises(DatasetError, match="all finite"):
+        fit(SHAPE, np.full((2, 32), np.nan, np.float32), np.zeros(2), FitOptions())
+
+
 def test_loss_that_diverges_ends_the_training():
     targets = np.full(64, 3e38)
     with pytest.raises(DatasetError, match="in epoch"):

@@ -19,6 +19,7 @@ from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
 from uwb_mitigation.training.data.dataset import Dataset, build_dataset
+from uwb_mitigation.training.fit.linear_fit import fit_linear_bias_to_rows
 from uwb_mitigation.types.measurement import Cir, RangeMeasurement, Record, Truth
 
 EMPTY = np.zeros(0, np.int16)
@@ -51,6 +52,16 @@ def dataset(records: list[Record]) -> Dataset:
 
 def mae(values: np.ndarray) -> float:
     return float(np.abs(values).mean())
+
+
+@pytest.mark.parametrize("has_levels", [False, True])
+def test_line_of_sight_is_spared_also_if_most_ranges_are_not(has_levels: bool):
+    generator = np.random.default_rng(3)
+    is_los = np.arange(1000) % 10 < 3
+    error = np.where(is_los, 0.0, 0.9) + generator.normal(0.0, 0.05, 1000)
+    levels = generator.uniform(-95.0, -75.0, (2, 1000)) if has_levels else np.full((2, 1000), np.nan)
+    left = error - fit_linear_bias_to_rows(*levels, error, is_los).predict_m(*levels)
+    assert mae(left[is_los]) < mae(error[is_los]) + 0.03
 
 
 def test_cirs_are_preferred_to_ranges_without():
