@@ -148,6 +148,9 @@ def test_anchor_that_is_not_where_the_file_says_is_named_first(bag: Path):
     states = {row[1]: row[0] for row in page.controls.health}
     assert states.pop("2") == health.BAD
     assert set(states.values()) == {health.UNKNOWN}, "their residuals are relative to a track that it bends"
+    assert {row[4] for row in page.controls.health} == {"-"}
+    advice = {row[-1] for row in page.controls.health if row[1] != "2"}
+    assert advice == {"Not judged: Anchor 2 bends the track."}
 
 
 def test_gaps_are_shown_as_gaps(tmp_path: Path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from types import SimpleNamespace
 
 import numpy as np
@@ -26,7 +27,11 @@ ANCHORS = {1: (0.0, 0.0), 2: (8.0, 0.0), 3: (0.0, 6.0), 4: (8.0, 6.0)}
 
 
 def driven(
-    errors_m: dict[int, float] | None = None, status: Status = Status.OK, count: int = 30, sd_m: float = 0.1
+    errors_m: dict[int, float] | None = None,
+    status: Status = Status.OK,
+    count: int = 30,
+    sd_m: float = 0.1,
+    senders: Iterable[int] = ANCHORS,
 ) -> tuple[Scene, Clock]:
     """Return a scene with ranges of four anchors to a tag at (4, 3), with an error for each anchor."""
     scene = Scene(clock := Clock())
@@ -37,7 +42,7 @@ def driven(
     for _ in range(count):
         clock.now_s += 0.1
         scene.add_pose("tag_7", Pose(4.0, 3.0, 0.0, stamp_s=clock.now_s + 900.0, sd_m=sd_m))
-        for anchor in ANCHORS:
+        for anchor in senders:
             range_m = 5.0 + (errors_m or {}).get(anchor, 0.0)
             scene.add_sample((anchor, 7), Sample(clock.now_s + 900.0, range_m, range_m, 0.1, status))
     return scene, clock
@@ -57,7 +62,7 @@ def test_good_position_has_its_accuracy_age_and_share_of_corrected_ranges():
     state, reason, _, facts = controls(scene).verdict
     assert (state, reason) == ("good", "")
     assert facts.startswith(
-        "horizontal sd 0.10 m, 95 % within 0.17 m \u00b7 last range 1.0 s old by stamp \u00b7 ranges corrected: 100.0 % (120 of 120 ranges)"
+        "horizontal sd 0.10 m, 95 % within 0.17 m \u00b7 last range 1.0 s old by stamp\nsince the start: ranges corrected: 100.0 % (120 of 120 ranges)"
     )
 
 
@@ -131,6 +136,19 @@ def test_verdict_names_the_reason(change, expected: tuple[str, str]):
     assert tuple(controls(scene).verdict[:2]) == expected
 
 
+def test_silent_anchors_are_named_before_the_geometry_of_the_others():
+    scene = driven(senders=(1, 2))[0]
+    scene.tags.clear()
+    scene.set_node_status("locator", CIRCLE)
+    page = shown(scene)
+    state, reason, action, _ = page.controls.verdict
+    assert (state, reason) == ("not determined", "only anchors 1 and 2 send ranges; no ranges from 3, 4")
+    assert action.startswith("Find out why: check power")
+    assert action.endswith("Without them: more anchors.")
+    assert [row[:2] for row in page.controls.health[2:]] == [[health.SILENT, "3"], [health.SILENT, "4"]]
+    assert page.column("map", "health")[2:] == [health.SILENT] * 2
+
+
 def test_better_verdict_is_held_back_and_a_seek_is_not():
     held = HeldVerdict()
     states = [held.update(Verdict(state), now_s).state
@@ -168,11 +186,15 @@ def test_radio_without_cirs_is_a_normal_state():
     page = shown(driven(status=Status.NO_CIR)[0])
     state, *_, facts = page.controls.verdict
     assert state == "good"
-    assert facts.endswith("ranges corrected: none (0 of 120 ranges: no CIRs)")
+    assert facts.endswith(
+        "correction: none (the radio sends no CIRs) \u00b7 ranges corrected: none (0 of 120 ranges: no CIRs)"
+    )
+    assert "not corrected" in page.column("map", "kind")
+    assert "corrected" not in page.column("map", "kind")
     assert (
         controls(driven(status=Status.BAD_CIR)[0])
         .verdict[3]
-        .endswith("none (0 of 120 ranges; 120 need attention)")
+        .endswith("none (0 of 120 ranges; 120 ranges not OK)")
     )
     assert {row[0] for row in page.controls.health} == {health.GOOD}
     assert page.cards()["Ranges corrected, since the start"] == ("none", "0 of 120 ranges: no CIRs")
@@ -203,6 +225,7 @@ def test_pairs_tags_and_nodes_without_data_are_marked():
     page.send("draw")
     assert page.column("pairs", "status") == ["no data for 12 s"] * 4
     assert page.column("pairs", "rate") == [0.0] * 4
+    assert [row[3:6] for row in page.controls.health[1:]] == [["-"] * 3] * 4, "no old means"
     assert page.column("map", "x1") == []
     assert "tag 7: no data for 12 s" in page.columns("map", "name")
     assert page.controls.nodes == [

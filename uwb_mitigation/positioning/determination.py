@@ -103,7 +103,7 @@ def determination(
         positions = "a height above and one below it" if is_level else "positions on both sides of it"
         assert position is not None
         remedies = _mirror_remedies(anchors, position, symmetry, dims, area, sd_m, is_level=is_level)
-    reason = f"the anchors are within {distance_m:.2f} m of {where}, so that {positions} explain ranges with errors of {sd_m:.2f} m"
+    reason = f"the {len(anchors)} received anchors are within {distance_m:.2f} m of {where}, so that {positions} explain ranges with errors of {sd_m:.2f} m"
     if area is not None:
         reason += "; the area does not exclude them"
     return Determination(state.value, reason, ", or ".join(remedies))

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from bokeh import models
+from bokeh.core.properties import value
 from bokeh.models import BooleanFilter, CDSView, ColumnDataSource, DataRange1d, Range1d
 from bokeh.palettes import cividis
 from bokeh.plotting import figure
@@ -51,12 +52,15 @@ TRACE_BEFORE, TRACE_AFTER = 20, 180  # samples before and after the first path
 HEIGHT = 380  # of the map, pixels, so that it is on the first screen
 HEADING_M = 1.0  # length of the line that shows the heading of a tag
 MAX_LABEL = 20  # characters of a name on the map
-RING = 22.0  # diameter of the ring around the selected anchor, pixels
+RING = 24.0  # diameter of the ring around the selected anchor, pixels
 MARGIN_M = 5.0  # around a tag on a map without anchors
 RANGE_SD_M = 0.1  # for the predicted accuracy if ranges have no standard deviation
 
 Lines = Mapping[str, Mapping[str, Any]]
 """Styles of the lines of a figure, {column: style}."""
+
+_SIDES = (0, -13, "center"), (14, 7, "left"), (-14, 7, "right"), (0, 28, "center")
+"""Places of a name above, right, left and below of its mark: offsets (pixels) and alignment."""
 
 _OPTIONAL = {"95 % ellipse": "width", "heading": "heading", "selected anchor": "ring"}
 """Layers of the map, and their columns that are NaN where they have nothing to show."""
@@ -197,6 +201,7 @@ class PositionErrors(Chart):
         table, raw = (positions.error_columns(kind) for kind in (TrackKind.CORRECTED, TrackKind.RAW))
         now_s = table[-1, 0] if is_live and len(table) else 0.0
         message = "" if np.isfinite(table[:, 1:]).any() else "No positions."
+        self.plot.legend[0].items[0].label = value(scene.track_name)
         self.fill(thinned(table - (now_s, 0.0, 0.0), NO_DATA_S), message)
         self.fill(thinned(raw[:, :2] - (now_s, 0.0), NO_DATA_S), message, self._raw)
 
@@ -283,7 +288,7 @@ class Map:
         self._page, self._fitted = page, (False, False, False)
         # Glyphs with NaN are not drawn: without a heading, for example.
         self._anchors = new_source("x", "y", "name", "id", "health", "label", "ring")
-        self._tags = new_source("x", "y", "name", "colour", "top", "width", "height", "angle", "heading")
+        self._tags = new_source("x", "y", "name", "colour", "width", "height", "angle", "heading")
         self._tracks = new_source("xs", "ys", "colour", "line_width", "dash", "kind")
         self._rays = new_source("x", "y", "x0", "y0", "x1", "y1", "status")
         self._accuracy = new_source("xs", "ys", "colour", "step")
@@ -304,10 +309,20 @@ class Map:
     def _layers(self) -> list[tuple[str, ColumnDataSource, dict[str, Any]]]:
         """Return the layers of the map, the lowest first: glyph, source and style."""
         marks, (marker, colour) = status_marks(), marks_of("health", health.LOOKS)
+        outline = factor_cmap("health", [GREY], [health.SILENT], nan_color=NIGHT)
         text = {
-            "text_align": "center", "text_font_size": "12px", "text_color": NIGHT, "level": "annotation",
+            "text_font_size": "12px", "text_color": NIGHT, "level": "annotation",
             "background_fill_color": PAPER, "background_fill_alpha": 0.8,
         }  # fmt: skip
+        # The script of the page selects the side of each name; without it, names are above.
+        names = [
+            ("text", source, text | {
+                "text": column, "x_offset": x, "y_offset": y, "text_align": align,
+                "view": CDSView(filter=BooleanFilter(None if y < 0 else [])),
+            })
+            for source, column in ((self._anchors, "label"), (self._tags, "name"))
+            for x, y, align in _SIDES
+        ]  # fmt: skip
         return [
             ("multi_polygons", self._accuracy, {
                 "fill_color": "colour", "fill_alpha": 0.6, "line_color": None, "legend_field": "step",
@@ -324,17 +339,15 @@ class Map:
             }),
             ("scatter", self._rays, marks | {"size": 7, "line_width": 2}),
             ("scatter", self._anchors, {
-                "marker": marker, "size": 15, "line_color": NIGHT, "fill_color": colour, "legend_label": "anchor",
+                "marker": marker, "size": 15, "line_color": outline, "fill_color": colour, "legend_label": "anchor",
             }),
             ("scatter", self._anchors, {
-                "size": "ring", "fill_color": None, "line_color": NIGHT, "line_width": 3, "legend_label": "selected anchor",
+                "size": "ring", "fill_color": None, "line_color": GREY, "line_width": 1.5, "legend_label": "selected anchor",
             }),
             ("scatter", self._tags, {
                 "marker": "star", "size": 18, "fill_color": "colour", "line_color": NIGHT, "legend_label": "tag",
             }),
-            # The script of the page hides names that cover others.
-            ("text", self._anchors, text | {"text": "label", "y_offset": -13, "view": CDSView(filter=BooleanFilter())}),
-            ("text", self._tags, text | {"text": "name", "y": "top", "y_offset": -6, "view": CDSView(filter=BooleanFilter())}),
+            *names,
         ]  # fmt: skip
 
     def draw(self, scene: Scene) -> None:
@@ -382,9 +395,8 @@ class Map:
             if age_s > NO_DATA_S:
                 name, colour = f"{name}: no data for {age_s:.0f} s", GREY
             major, minor, angle = map(drawable, pose.ellipse)
-            half_height_m = finite_or_zero(math.hypot(major * math.sin(angle), minor * math.cos(angle)))
             ellipse = 2 * major, 2 * minor, angle
-            rows.append((pose.x, pose.y, name, colour, pose.y + half_height_m, *ellipse, pose.heading_rad))
+            rows.append((pose.x, pose.y, name, colour, *ellipse, pose.heading_rad))
         set_rows(self._tags, rows)
 
     def _draw_tracks(self, scene: Scene) -> None:
@@ -405,7 +417,8 @@ class Map:
                 colour, *style = palette.TRACK_STYLES[kind]
                 if kind is TrackKind.CORRECTED:
                     colour = colours.get(name, BLUE)
-                rows.append((*self._trail(track.rows, scene.age_s(track)).T, colour, *style, kind.value))
+                label = scene.track_name if kind is TrackKind.CORRECTED else kind.value
+                rows.append((*self._trail(track.rows, scene.age_s(track)).T, colour, *style, label))
             set_rows(self._tracks, rows)
 
     def _trail(self, track: NDArray[np.float64], age_s: float) -> NDArray[np.float32]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +16,6 @@ from uwb_mitigation.viewer.histories import HISTORY_S
 from uwb_mitigation.viewer.palette import ATTRIBUTES, TrackKind
 from uwb_mitigation.viewer.scene import DEFAULT_TAG, Scene, tag_label, tag_name
 from uwb_mitigation.viewer.state import View
-
-if TYPE_CHECKING:
-    # A live page reads no recordings.
-    pass
 
 WHOLE, RECENT, LIVE = "whole recording", f"last {HISTORY_S:.0f} s", "since the start"
 """Names of the intervals."""
@@ -46,8 +42,10 @@ def _range_cards(scene: Scene, window: str) -> list[Card]:
         return []
     share = f"{100.0 * corrected / count:.1f} %" if corrected else "none"
     text = f"{corrected} of {count} ranges" + ("" if corrected or faults else ": no CIRs")
-    text += f"; {faults} need attention" if faults else ""
+    text += f"; {faults} ranges not OK" if faults else ""
     shown = [[f"Ranges corrected, {window}", share, text]]
+    if not corrected and not faults:
+        shown.insert(0, [f"Correction, {window}", "none", "the radio sends no CIRs"])
     if scene.errors:
         raw, mean = map(_metres, scene.error_sums_m / scene.errors)
         shown.append([f"Mean absolute range error, {window}", mean, f"raw: {raw}"])

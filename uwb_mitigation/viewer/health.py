@@ -26,17 +26,20 @@ EVIDENCE = 10
 RELEASE = 0.8
 """A state ends below this share of the limit at which it begins (hysteresis)."""
 GOOD, CHECK, BAD, UNKNOWN = "\u2713 good", "! check", "\u2297 bad", "? unknown"
+SILENT = "\u25cb no ranges"
 LOOKS = {
     GOOD: ("hex", GREEN),
     CHECK: ("square_pin", ORANGE),
     BAD: ("circle_x", VERMILLION),
     UNKNOWN: ("hex_dot", PAPER),
+    SILENT: ("hex", PAPER),
 }
 """Marker and colour of an anchor for each state; statuses of ranges have other markers."""
 STATES = (
-    f"{BAD}: no ranges, or a mean residual over {VERY_LONG_M:.2f} m with line of sight. {CHECK}: a mean residual over {LONG_M:.2f} "
+    f"{BAD}: ranges stopped, or a mean residual over {VERY_LONG_M:.2f} m with line of sight. {CHECK}: a mean residual over {LONG_M:.2f} "
     f"m, {MAX_LOST:.0f} % lost, {MAX_NOT_OK:.0f} % with a status that needs attention, or {MAX_NLOS:.0f} % NLOS. {UNKNOWN}: fewer than "
-    f"{EVIDENCE} ranges can be compared with the position. The status of a pair shows only whether the network could correct the range."
+    f"{EVIDENCE} ranges can be compared with the position. {SILENT}: none so far, or of no anchor. The status "
+    "of a pair shows only whether the network could correct the range."
 )
 """Definition of the states, for the page."""
 POSITION_GOOD, DEGRADED, LOST = "good", "degraded", "lost"
@@ -64,8 +67,8 @@ the estimated position (m); `evidence`, number of residuals; `stopped`, age of t
 
 FAULTS = (
     ("stopped", 0.0, BAD, "has not answered for {stopped:.0f} s: check its power and PAN id."),
-    ("displaced", 0.0, BAD, "is not where the anchors file says: its ranges differ by {displaced:.2f} m from the track of the others, "
-                            "and fit another position. Measure it again."),
+    ("displaced", 0.0, BAD, "is not where the anchors file says: its ranges fit another position, and differ by {displaced:.2f} m "
+                            "(median) from a track without them. Measure it again, or run `uwb-mitigation survey`."),
     # Without line of sight, ranges may be long although anchor and offset are right.
     ("blocked", LONG_M, CHECK, "reads {size:.2f} m {direction}, with {nlos:.0f} % NLOS: its line of sight is probably blocked. Move it if possible."),
     ("clear", VERY_LONG_M, BAD, "reads {size:.2f} m {direction}: calibrate, or check its position."),
@@ -124,7 +127,9 @@ def advice(anchors: Mapping[int, Means], names: Mapping[int, str] = {}) -> tuple
         return common, dict.fromkeys(anchors, "")
     labels = {anchor_id: f"Anchor {names.get(anchor_id) or format_id(anchor_id)}" for anchor_id in anchors}
     found = {anchor_id: faults(means) for anchor_id, means in anchors.items()}
-    return "", {key: f"{labels[key]} {texts[0][1]}" if texts else "" for key, texts in found.items()}
+    wrong = [label for key, label in labels.items() if anchors[key]["displaced"]]
+    other = f"Not judged: {wrong[0]} bends the track." if wrong else ""
+    return "", {key: f"{labels[key]} {texts[0][1]}" if texts else other for key, texts in found.items()}
 
 
 def _common_advice(anchors: list[Means]) -> str:
@@ -178,6 +183,7 @@ def verdict(
     name = "" if tag_id is None else f"tag {format_id(tag_id)}"
     ages_s = [scene.age_s(history) for (_, pair_tag), history in scene.pairs.items() if pair_tag == tag_id]
     pose = next(iter(scene.tags.values()), None) if tag_id is None else scene.tag_of(tag_id)
+    received = [key for key, means in anchors.items() if means["stopped"] == 0.0]
     reason, action = _of_remedy(remedy)
     if tag_id is None and pose is None:
         return Verdict(WAITING)
@@ -185,8 +191,14 @@ def verdict(
         reason = f"no ranges of {name} for {min(ages_s):.0f} s"
         return Verdict(LOST, reason, "Check power of the tag, and the driver.")
     if pose is None:
-        action = _sentence(action or "See the notices below")
-        return Verdict(UNDETERMINED, reason or f"no position of {name}", action)
+        action = action or "see the notices below"
+        silent = sorted(set(scene.anchors).difference(received))
+        if silent and 0 < len(received) <= MIN_ANCHORS:
+            senders, missing = " and ".join(map(format_id, received)), ", ".join(map(format_id, silent[:6]))
+            senders = f"anchors {senders} send" if len(received) > 1 else f"anchor {senders} sends"
+            reason = f"only {senders} ranges; no ranges from {missing}" + (", ..." if silent[6:] else "")
+            action = f"Find out why: check power, PAN id, and ids in the anchors file. Without them: {action}"
+        return Verdict(UNDETERMINED, reason or f"no position of {name}", _sentence(action))
     if scene.age_s(pose) > NO_DATA_S:
         reason = f"no position of {name} for {scene.age_s(pose):.0f} s"
         return Verdict(LOST, reason, _sentence(remedy or "Drive into the area of the anchors"))
@@ -196,12 +208,11 @@ def verdict(
     common, texts = advice(anchors, names)
     # With a common cause, anchors that need attention are bad together.
     bad = [key for key in anchors if states[key] == BAD or (common and states[key] == CHECK)]
-    received = sum(means["stopped"] == 0.0 for means in anchors.values())
     if not reason and bad:
         worst = max(bad, key=lambda key: [abs(anchors[key][n]) for n in ("stopped", "displaced", "residual")])
         reason, _, action = (common or texts[worst]).partition(": ")
-    elif not reason and anchors and received < MIN_ANCHORS:
-        reason, action = f"{received} anchors received", "Drive closer to the anchors, or add some."
+    elif not reason and anchors and len(received) < MIN_ANCHORS:
+        reason, action = f"{len(received)} anchors received", "Drive closer to the anchors, or add some."
     elif not reason and math.isnan(sd_m):
         reason, action = "its standard deviation is unknown", "Publish poses with a covariance."
     elif not reason and sd_m > MAX_SD_M:

@@ -174,6 +174,11 @@ class Scene:
         """Numbers of ranges."""
         return self.corrected, self.ranges, self.faults
 
+    @property
+    def track_name(self) -> str:
+        """The name of the tracks of `TrackKind.CORRECTED` in legends."""
+        return "not corrected" if self.ranges and not self.corrected else TrackKind.CORRECTED.value
+
     def now_s(self, tag_id: int | None = None) -> float:
         """Return the latest stamp of a tag (None: of the latest range) plus the time since then; NaN before any."""
         entry = (

@@ -73,10 +73,12 @@ class Texts:
         anchors = health.anchor_means(pairs)
         # If no anchor answers, the cause is not in each of them.
         is_lost = all(means["stopped"] > 0.0 for means in anchors.values())
-        states = {
-            key: health.UNKNOWN if is_lost else self._health(key, means) for key, means in anchors.items()
+        states = dict.fromkeys(scene.anchors if anchors else (), health.SILENT) | {
+            key: health.SILENT if is_lost else self._health(key, means) for key, means in anchors.items()
         }
-        page.health = {key: (state, anchors[key]["residual"]) for key, state in states.items()}
+        page.health = {
+            key: (state, anchors.get(key, {}).get("residual", math.nan)) for key, state in states.items()
+        }
         names = {anchor_id: place.name for anchor_id, place in scene.anchors.items() if place.name}
         notices = self._notices(scene)
         of_tags: dict[int | None, dict[int, Means]] = {page.tag_id: {}}
@@ -112,13 +114,14 @@ class Texts:
         rows, pairs = list[tuple[Any, ...]](), dict[Pair, Means]()
         for pair, history, sample in scene.latest():
             missing, age_s = scene.no_data(history), scene.age_s(history)
-            means = history.statistics() | {
+            means = dict.fromkeys(history.statistics(), math.nan) if missing else history.statistics()
+            means |= {
                 "rate": 0.0 if missing else history.rate_hz(scene.stamp_age_s(pair)),
                 "stopped": age_s if missing else 0.0,
                 "displaced": 0.0 if timeline is None else timeline.displaced.get(pair[0], 0.0),
             }
-            if timeline is not None and timeline.displaced and pair[0] not in timeline.displaced:
-                # A displaced anchor bends the track with which the others are compared.
+            if timeline is not None and timeline.displaced:
+                # A displaced anchor bends the track with which all are compared.
                 means |= {"residual": math.nan, "evidence": 0.0}
             pairs[pair] = means
             status, ids = missing or sample.status.name, map(format_id, pair)
@@ -148,17 +151,18 @@ class Texts:
         return self._verdicts[tag_id].update(verdict, scene.clock())
 
     def _facts(self, scene: Scene, accuracy: str) -> str:
-        """Return accuracy, age and share of corrected ranges."""
+        """Return accuracy and age, and a line for each other interval: what the correction changes, share of corrected ranges."""
         tag_id, texts = self._page.tag_id, [accuracy] if accuracy else []
         if tag_id is not None and math.isfinite(stamp_s := scene.latest_stamp_s(tag_id)):
             texts.append(f"last range {scene.stamp_clock() - stamp_s:.1f} s old by stamp")
-        for title, value, text in self._cards:
-            name, _, _ = title.lower().partition(",")
-            if name in ("ranges corrected", "correction"):
-                texts.append(f"{name}: {value} ({text})")
         if scene.dropped:
             texts.append(f"{scene.dropped} ranges dropped by the viewer")
-        return " \u00b7 ".join(texts)
+        lines = {"": texts} if texts else {}
+        for title, value, text in self._cards:
+            name, _, interval = title.partition(", ")
+            if name in ("Ranges corrected", "Correction"):
+                lines.setdefault(f"{interval}: ", []).append(f"{name.lower()}: {value} ({text})")
+        return "\n".join(interval + " \u00b7 ".join(facts) for interval, facts in lines.items())
 
     def _notices(self, scene: Scene) -> list[str]:
         """Return the reasons for an empty page, and what needs attention."""
@@ -210,11 +214,11 @@ def _anchor_rows(anchors: dict[int, Means], states: dict[int, str], names: dict[
     common, advice = health.advice(anchors, names)
     worst = health.BAD if health.BAD in states.values() else health.CHECK
     rows = [[worst, "all", "", "", "", "", common]] if common else []
-    for anchor_id, means in anchors.items():
-        digits = {"rate": 1, "nlos": 0, "residual": 2, "lost": 0}
-        texts = [_number(means[name], count) for name, count in digits.items()]
+    for anchor_id in sorted(states):
+        digits, means = {"rate": 1, "nlos": 0, "residual": 2, "lost": 0}, anchors.get(anchor_id, {})
+        texts = [_number(means.get(name, math.nan), count) for name, count in digits.items()]
         label = format_id(anchor_id) + (f" ({names[anchor_id]})" if anchor_id in names else "")
-        rows.append([states[anchor_id], label, *texts, advice[anchor_id]])
+        rows.append([states[anchor_id], label, *texts, advice.get(anchor_id, "")])
     return rows
 
 

@@ -105,19 +105,21 @@ function start(doc) {
     const xrs = new Map([[map.x_range, moved(map.x_range, x)]]), yrs = new Map([[map.y_range, moved(map.y_range, y)]]);
     view.update_range({xrs, yrs}, {panning: zoom === 1, scrolling: zoom !== 1});
   };
-  // A name that would cover a tag or another name is hidden: tags come first, then the selected anchor.
-  const names = map.renderers.filter(({glyph}) => glyph.text).reverse();
+  // A name is on the first side where it covers no mark and no other name, else hidden: tags come first, then the selected anchor.
+  const names = map.renderers.filter(({glyph}) => glyph.text), named = [...new Set(names.map((layer) => layer.data_source))].reverse();
   const placeNames = () => {
-    const {x_scale, y_scale} = Bokeh.index.find_one(map).frame, {x, y} = names[0].data_source.data;
-    const boxes = x.map((_, i) => [9, x_scale.compute(x[i]), y_scale.compute(y[i]) + 10]);
-    for (const {view, glyph, data_source: {data}} of names) {
-      const booleans = data[glyph.text.field].map((text, i) => {
-        const box = [3.5 * text.length + 2, x_scale.compute(data.x[i]), y_scale.compute(data[glyph.y.field][i]) + glyph.y_offset.value];
-        const isFree = boxes.every(([half, x, y]) => Math.abs(x - box[1]) > half + box[0] || Math.abs(y - box[2]) > 14);
-        if (isFree) boxes.push(box);
-        return isFree;
-      });
-      if (String(booleans) !== String(view.filter.booleans)) view.filter.setv({booleans}, {sync: false});
+    const {x_scale, y_scale} = Bokeh.index.find_one(map).frame;
+    const boxes = named.flatMap(({data: {x, y}}) => Array.from(x, (_, i) => [9, x_scale.compute(x[i]), y_scale.compute(y[i]) + 9]));
+    for (const source of named) {
+      const sides = names.filter((layer) => layer.data_source === source), {data} = source, places = [...data.x].map((_, i) => sides.find(({glyph}) => {
+        const half = 3.5 * data[glyph.text.field][i].length + 2, toSide = {left: half, right: -half}[glyph.text_align.value] ?? 0;
+        const box = [half, x_scale.compute(data.x[i]) + glyph.x_offset.value + toSide, y_scale.compute(data[glyph.y.field][i]) + glyph.y_offset.value];
+        return boxes.every(([half, x, y]) => Math.abs(x - box[1]) > half + box[0] || Math.abs(y - box[2]) > 14) && boxes.push(box);
+      }));
+      for (const side of sides) {
+        const booleans = places.map((place) => place === side);
+        if (String(booleans) !== String(side.view.filter.booleans)) side.view.filter.setv({booleans}, {sync: false});
+      }
     }
   };
   // Data, view and size of the map change without a common event.
@@ -140,7 +142,7 @@ function start(doc) {
   }).observe($(figure.name));
 
   $("map").addEventListener("click", (event) => {
-    const view = Bokeh.index.find_one(map), box = view.el.getBoundingClientRect(), {x_scale, y_scale} = view.frame, {x, y, id} = names[1].data_source.data;
+    const view = Bokeh.index.find_one(map), box = view.el.getBoundingClientRect(), {x_scale, y_scale} = view.frame, {x, y, id} = named[1].data;
     const i = id.findIndex((_, i) => Math.hypot(x_scale.compute(x[i]) - event.clientX + box.left, y_scale.compute(y[i]) - event.clientY + box.top) < 15);
     const {anchor, tag} = source.data, own = [...anchor.keys()].filter((pair) => BigInt(anchor[pair]) == id[i]);
     const pair = own.find((pair) => tag[pair] === controls.selected[1]) ?? own[0];
@@ -177,7 +179,7 @@ function start(doc) {
       const mark = (share, colour, text) => `<text x="${100 * share}%" y="11" fill="${colour}">${text}</text>`;
       $("bad-marks").innerHTML = bad.map((share) => mark(share, "#d55e00", "|")).join("")
         + incidents.map((share) => mark(share, "currentColor", "\u25c6")).join("");
-      $("marks-legend").textContent = `| bad ranges: ${count}, \u25c6 events: ${incidents.length}`;
+      $("marks-legend").textContent = `whole recording: | ${count} ranges not OK, \u25c6 ${incidents.length} events`;
     });
   }
   on("player", () => {
