@@ -150,7 +150,7 @@ def test_anchor_that_is_not_where_the_file_says_is_named_first(bag: Path):
     assert set(states.values()) == {health.UNKNOWN}, "their residuals are relative to a track that it bends"
     assert {row[4] for row in page.controls.health} == {"-"}
     advice = {row[-1] for row in page.controls.health if row[1] != "2"}
-    assert advice == {"Not judged: Anchor 2 bends the track."}
+    assert advice == {"Not judged: see anchor 2."}
 
 
 def test_gaps_are_shown_as_gaps(tmp_path: Path):
@@ -172,7 +172,7 @@ def test_gaps_are_shown_as_gaps(tmp_path: Path):
 def test_index_reads_all_ranges(bag: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(recorded_ranges, "CHUNK", 100)
     whole = indexed(bag).whole
-    assert whole.counts == (999, 1000, 1)
+    assert (whole.corrected, whole.ranges, whole.faults) == (999, 1000, 1)
     assert all(np.isfinite(history.columns.true_m).all() for history in whole.pairs.values())
     assert len(whole.pairs[1, 7].rows) == 200
 

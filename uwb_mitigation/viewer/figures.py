@@ -310,14 +310,11 @@ class Map:
         """Return the layers of the map, the lowest first: glyph, source and style."""
         marks, (marker, colour) = status_marks(), marks_of("health", health.LOOKS)
         outline = factor_cmap("health", [GREY], [health.SILENT], nan_color=NIGHT)
-        text = {
-            "text_font_size": "12px", "text_color": NIGHT, "level": "annotation",
-            "background_fill_color": PAPER, "background_fill_alpha": 0.8,
-        }  # fmt: skip
         # The script of the page selects the side of each name; without it, names are above.
         names = [
-            ("text", source, text | {
-                "text": column, "x_offset": x, "y_offset": y, "text_align": align,
+            ("text", source, {
+                "text": column, "text_font_size": "12px", "text_color": NIGHT, "x_offset": x, "y_offset": y, "text_align": align,
+                "background_fill_color": PAPER, "background_fill_alpha": 0.8, "level": "annotation",
                 "view": CDSView(filter=BooleanFilter(None if y < 0 else [])),
             })
             for source, column in ((self._anchors, "label"), (self._tags, "name"))
@@ -374,9 +371,11 @@ class Map:
         # The selected one first: its name has priority.
         for identity in sorted(scene.anchors, key=lambda identity: identity != selected):
             anchor = scene.anchors[identity]
-            state, residual_m = page.health.get(identity, (health.UNKNOWN, math.nan))
+            state, residual_m = page.health.get(identity, (health.SILENT, math.nan))
             name = anchor.name or format_id(identity)
-            label = name[:MAX_LABEL] + (f" {state[0]}" if state != health.UNKNOWN else "")
+            label = name[:MAX_LABEL] + (
+                f" {state[0]}" if state not in (health.UNKNOWN, health.SILENT) else ""
+            )
             if timeline is not None and identity in timeline.displaced:
                 label += " not here"
             elif state in (health.BAD, health.CHECK) and abs(residual_m) >= health.LONG_M:
@@ -414,10 +413,9 @@ class Map:
         if self._page.changed("tracks", state):
             rows = []
             for kind, name, track in tracks:
-                colour, *style = palette.TRACK_STYLES[kind]
+                (colour, *style), label = palette.TRACK_STYLES[kind], kind.value
                 if kind is TrackKind.CORRECTED:
-                    colour = colours.get(name, BLUE)
-                label = scene.track_name if kind is TrackKind.CORRECTED else kind.value
+                    colour, label = colours.get(name, BLUE), scene.track_name
                 rows.append((*self._trail(track.rows, scene.age_s(track)).T, colour, *style, label))
             set_rows(self._tracks, rows)
 

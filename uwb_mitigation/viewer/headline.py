@@ -37,7 +37,7 @@ def cards(view: View, tag_id: int | None) -> list[Card]:
 
 def _range_cards(scene: Scene, window: str) -> list[Card]:
     """Return the figures of ranges."""
-    corrected, count, faults = scene.counts
+    corrected, count, faults = scene.corrected, scene.ranges, scene.faults
     if not count:
         return []
     share = f"{100.0 * corrected / count:.1f} %" if corrected else "none"

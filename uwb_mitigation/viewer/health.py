@@ -127,8 +127,8 @@ def advice(anchors: Mapping[int, Means], names: Mapping[int, str] = {}) -> tuple
         return common, dict.fromkeys(anchors, "")
     labels = {anchor_id: f"Anchor {names.get(anchor_id) or format_id(anchor_id)}" for anchor_id in anchors}
     found = {anchor_id: faults(means) for anchor_id, means in anchors.items()}
-    wrong = [label for key, label in labels.items() if anchors[key]["displaced"]]
-    other = f"Not judged: {wrong[0]} bends the track." if wrong else ""
+    wrong = [format_id(key) for key, means in anchors.items() if means["displaced"]]
+    other = f"Not judged: see anchor {wrong[0]}." if wrong else ""
     return "", {key: f"{labels[key]} {texts[0][1]}" if texts else other for key, texts in found.items()}
 
 

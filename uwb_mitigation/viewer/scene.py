@@ -59,9 +59,6 @@ HEIGHT_VARIANCE_M2 = 0.01
 DEFAULT_TAG = "tag"
 """Name of the tag whose topics have the plain names; the others are named as `tag_frame` does."""
 
-Counts = tuple[int, int, int]
-"""Numbers of corrected ranges, of all ranges, and of those with a status that needs attention."""
-
 
 @dataclass(slots=True)
 class Pose:
@@ -168,11 +165,6 @@ class Scene:
         self.error_counts = np.zeros((2, len(ERROR_EDGES_M) - 1), np.int64)
         self.error_sums_m, self.errors = np.zeros(2), 0
         self.revision += 1
-
-    @property
-    def counts(self) -> Counts:
-        """Numbers of ranges."""
-        return self.corrected, self.ranges, self.faults
 
     @property
     def track_name(self) -> str:
@@ -308,11 +300,8 @@ class Scene:
         """Show the minute before a time of a recording, and its tracks until then; counts are those of all its ranges."""
         self.clear()
         self.ranges, self.corrected, self.faults = whole.ranges, whole.corrected, whole.faults
-        self.errors, self.error_counts, self.error_sums_m = (
-            whole.errors,
-            whole.error_counts,
-            whole.error_sums_m,
-        )
+        self.errors, self.error_counts = whole.errors, whole.error_counts
+        self.error_sums_m = whole.error_sums_m
         histories = {pair: history.until(now_s, now_s - HISTORY_S) for pair, history in whole.pairs.items()}
         for pair, history in sorted(histories.items(), key=lambda item: item[1].received_s):
             if (latest := history.latest) is not None:

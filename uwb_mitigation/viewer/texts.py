@@ -13,13 +13,7 @@ from uwb_mitigation.positioning.determination import UNKNOWN_POSITION
 from uwb_mitigation.viewer import health
 from uwb_mitigation.viewer.headline import Card, cards
 from uwb_mitigation.viewer.health import HeldVerdict, Means, Verdict
-from uwb_mitigation.viewer.histories import (
-    HISTORY_S,
-    NO_DATA_S,
-    RATE_RANGES,
-    STATISTICS,
-    Pair,
-)
+from uwb_mitigation.viewer.histories import HISTORY_S, NO_DATA_S, RATE_RANGES, STATISTICS, Pair
 from uwb_mitigation.viewer.scene import Scene, plain_tag_id, tag_label, tag_name
 from uwb_mitigation.viewer.state import PageState, new_source, set_rows
 
@@ -73,12 +67,10 @@ class Texts:
         anchors = health.anchor_means(pairs)
         # If no anchor answers, the cause is not in each of them.
         is_lost = all(means["stopped"] > 0.0 for means in anchors.values())
-        states = dict.fromkeys(scene.anchors if anchors else (), health.SILENT) | {
+        states = dict.fromkeys(scene.anchors, health.SILENT) | {
             key: health.SILENT if is_lost else self._health(key, means) for key, means in anchors.items()
         }
-        page.health = {
-            key: (state, anchors.get(key, {}).get("residual", math.nan)) for key, state in states.items()
-        }
+        page.health = {key: (states[key], means["residual"]) for key, means in anchors.items()}
         names = {anchor_id: place.name for anchor_id, place in scene.anchors.items() if place.name}
         notices = self._notices(scene)
         of_tags: dict[int | None, dict[int, Means]] = {page.tag_id: {}}

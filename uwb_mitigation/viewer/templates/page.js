@@ -179,7 +179,7 @@ function start(doc) {
       const mark = (share, colour, text) => `<text x="${100 * share}%" y="11" fill="${colour}">${text}</text>`;
       $("bad-marks").innerHTML = bad.map((share) => mark(share, "#d55e00", "|")).join("")
         + incidents.map((share) => mark(share, "currentColor", "\u25c6")).join("");
-      $("marks-legend").textContent = `whole recording: | ${count} ranges not OK, \u25c6 ${incidents.length} events`;
+      $("marks-legend").textContent = `whole recording: | ranges not OK: ${count}, \u25c6 events: ${incidents.length}`;
     });
   }
   on("player", () => {
