@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,14 +13,13 @@ from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.tracks import Odometry, Ranges, Track, TruePath
 
-HALL = AnchorMap(
-    [
-        Anchor(number, place, 0.01)
-        for number, place in enumerate(
-            [(0.0, 0.0, 2.5), (12.0, 0.0, 0.5), (12.0, 9.0, 2.5), (0.0, 9.0, 0.5), (6.0, 0.0, 1.5)], 1
-        )
-    ]
-)
+
+def anchors_at(places: Iterable[Sequence[float]], sd: float = 0.01) -> AnchorMap:
+    """Return anchors with the ids 1, 2, ... at places."""
+    return AnchorMap([Anchor(number, tuple(place), sd) for number, place in enumerate(places, 1)])
+
+
+HALL = anchors_at([(0.0, 0.0, 2.5), (12.0, 0.0, 0.5), (12.0, 9.0, 2.5), (0.0, 9.0, 0.5), (6.0, 0.0, 1.5)])
 NANOSECONDS = 1_000_000_000
 ODOMETRY_HZ = 50.0
 
@@ -62,14 +63,7 @@ def drive(
     return ranges, TruePath(stamp_ns, position)
 
 
-WALL = AnchorMap(
-    [
-        Anchor(number, place, 0.03)
-        for number, place in enumerate(
-            [(1, -3, 0.2), (1, 3, 0.2), (1, -3, 2.5), (1, 3, 2.5), (1.1, 0, 1.3)], 1
-        )
-    ]
-)
+WALL = anchors_at([(1, -3, 0.2), (1, 3, 0.2), (1, -3, 2.5), (1, 3, 2.5), (1.1, 0, 1.3)], 0.03)
 """Anchors on one wall: beyond it is a mirror image of every position."""
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drives import HALL, circuit, drive
+from drives import HALL, anchors_at, circuit, drive
 
 from uwb_mitigation.calibration.hypotheses import AnchorHypotheses
 from uwb_mitigation.calibration.motion_segments import find_segments
@@ -15,7 +15,6 @@ from uwb_mitigation.calibration.self_calibration import self_calibrate
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.noise_model import SLOPE_SD, NoiseModel, Regressors
-from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.tracks import PosePath, Ranges
 
 LEVEL = Height(1.0)
@@ -87,7 +86,7 @@ def test_carried_tag_at_16_positions_determines_offset_and_ranges():
     """128 links to 24 anchors, 35 % of them behind obstacles that also reduce the power; a pause between positions."""
     rng = np.random.default_rng(1)
     where = np.column_stack([rng.uniform(0, 40, 24), rng.uniform(0, 25, 24), rng.uniform(2, 5, 24)])
-    anchors = AnchorMap([Anchor(n, tuple(place), 0.02) for n, place in enumerate(where.tolist(), 1)])
+    anchors = anchors_at(where, 0.02)
     placements, truth = [], []
     for number in range(16):
         distance = np.linalg.norm(where - [rng.uniform(3, 37), rng.uniform(3, 22), 1.0], axis=1)

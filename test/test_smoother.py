@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drives import HALL, block, drive
+from drives import HALL, anchors_at, block, drive
 from scipy.optimize import least_squares
 
 from uwb_mitigation.positioning.batch.least_squares import LeastSquares
@@ -15,7 +15,6 @@ from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.tag_estimator import TagEstimator
 from uwb_mitigation.positioning.track_errors import track_errors
-from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.tracks import Track, TruePath
 
 
@@ -95,7 +94,7 @@ def test_smoothed_tracks_are_consistent_and_better_than_live_ones():
 @pytest.mark.parametrize("seed", range(4))
 def test_smoothed_track_among_obstacles_is_not_worse_than_live(seed: int):
     box = np.array([(x, y, z) for x in (0.0, 12.0) for y in (0.0, 9.0) for z in (0.2, 2.8)])
-    anchors = AnchorMap([Anchor(i, tuple(p), 0.03) for i, p in enumerate(box.tolist(), 1)])
+    anchors = anchors_at(box, 0.03)
     ranges, truth = drive(anchors, seconds=40, seed=seed)
     block(ranges, seed)
     # Obstacles make raw ranges too long, which have no variance.

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drives import HALL, circuit, drive
+from drives import HALL, anchors_at, circuit, drive
 
 from uwb_mitigation.calibration.survey import displacements, survey_anchors
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.geometry import Area, Height
-from uwb_mitigation.types.anchors import Anchor, AnchorMap
+from uwb_mitigation.types.anchors import SD_M
 
 LEVEL = Height(1.0)
 
@@ -42,27 +42,25 @@ def test_anchors_that_contradict_the_ranges_are_reported(minute):
     assert not survey_anchors(EstimatorConfig(HALL, height=LEVEL), shuffled).explained
 
 
-def test_only_the_displaced_anchor_is_named(minute):
-    wrong = HALL.position.copy()
-    wrong[2] += (0.4, 0.3, 0.0)
-    found = survey_anchors(EstimatorConfig(HALL.moved(wrong, HALL.sd), height=LEVEL), minute)
-    assert (found.misplaced, found.swapped) == ([2], [])
-    assert survey_anchors(EstimatorConfig(HALL, height=LEVEL), minute).misplaced == []
+MOVED = HALL.position + np.outer(np.arange(5) == 2, (0.4, 0.3, 0.0))
 
 
-def test_swapped_pair_is_named(minute):
-    wrong = HALL.position.copy()
-    wrong[[1, 3]] = wrong[[3, 1]]
-    found = survey_anchors(EstimatorConfig(HALL.moved(wrong, HALL.sd), height=LEVEL), minute)
-    assert found.swapped == [(1, 3)]
-    assert sorted(found.misplaced) == [1, 3]
+@pytest.mark.parametrize(
+    ("position", "misplaced", "swapped"),
+    [
+        (HALL.position, [], []),
+        (MOVED, [2], []),
+        (HALL.position[[0, 3, 2, 1, 4]], [1, 3], [(1, 3)]),
+    ],
+)
+def test_only_anchors_at_wrong_positions_are_named(minute, position, misplaced, swapped):
+    found = survey_anchors(EstimatorConfig(HALL.moved(position, HALL.sd), height=LEVEL), minute)
+    assert (sorted(found.misplaced), found.swapped) == (misplaced, swapped)
 
 
 def test_mirror_image_of_a_square_is_not_a_swapped_pair():
     """Swapped opposite anchors of a square are its mirror image, which explains the ranges as well as the truth."""
-    square = AnchorMap(
-        [Anchor(i, (x, y, 2.0)) for i, (x, y) in enumerate([(2, 0), (10, 0), (10, 8), (2, 8)], 1)]
-    )
+    square = anchors_at([(2, 0, 2), (10, 0, 2), (10, 8, 2), (2, 8, 2)], SD_M)
     ranges, _ = drive(square, seconds=40, rate_hz=10.0, seed=2)
     guesses = square.position + np.random.default_rng(3).normal(0, (0.4, 0.4, 0), (4, 3))
     found = survey_anchors(EstimatorConfig(square.moved(guesses, square.sd), height=LEVEL), ranges, off_m=0.4)
@@ -72,7 +70,7 @@ def test_mirror_image_of_a_square_is_not_a_swapped_pair():
 
 @pytest.mark.parametrize(("guess_sd_m", "mirrored"), [(0.1, False), (0.7, True)])
 def test_mirror_image_that_fits_the_guesses_as_well_is_reported(guess_sd_m: float, mirrored: bool):
-    narrow = AnchorMap([Anchor(i, (4.0 * i - 4.0, 0.4 * (-1) ** i, 2.0)) for i in range(1, 5)])
+    narrow = anchors_at([(4.0 * i - 4.0, 0.4 * (-1) ** i, 2.0) for i in range(1, 5)], SD_M)
     ranges, _ = drive(narrow, seconds=20, seed=2)
     wrong = narrow.position + np.random.default_rng(4).normal(0, (guess_sd_m, guess_sd_m, 0), (4, 3))
     area = Area((-5, 1, 0), (20, 20, 3))
