@@ -7,10 +7,10 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import command_line
 import numpy as np
 import pytest
 from bag_material import write_records
+from command_line import run, succeed
 from model_material import amplitudes_only, changed
 
 from uwb_mitigation.calibration.radio_offsets import estimate_offset
@@ -110,7 +110,7 @@ def test_distance_counts_without_levels_and_cirs_with_a_warning(tmp_path: Path):
         for number in range(20):
             range_m = 5.25 + 0.01 * (number % 2)
             out.write(Record(RangeMeasurement(10**8 * number, 1, 7, number, 0, range_m, Cir(NO_SAMPLES))))
-    outcome = command_line.succeed("offset los.mcap --distance 5", folder=tmp_path)
+    outcome = succeed("offset los.mcap --distance 5", folder=tmp_path)
     assert "offset 0.255 m" in outcome.stdout
     assert "line of sight was not checked" in outcome.stderr
 
@@ -126,11 +126,8 @@ def test_single_distance_needs_a_single_pair(universal: Mitigation, direct: list
 
 
 def test_los_of_the_real_logs_gives_the_offset_of_the_boards(apartment_imported: Path, tmp_path: Path):
-    outcome = command_line.run(
-        "offset", apartment_imported / "apartment.mcap", "--truth", "--common", "-o", "o.yaml", "--json", "o.json",
-        "--model", default_model_path(), folder=tmp_path,
-    )  # fmt: skip
-    assert outcome.returncode == 0, outcome.stderr
+    options = ("--truth", "--common", "-o", "o.yaml", "--json", "o.json", "--model", default_model_path())
+    succeed("offset", apartment_imported / "apartment.mcap", *options, folder=tmp_path)
     result = json.loads((tmp_path / "o.json").read_text())
     # The median of the placements that are labelled LOS.
     assert result["offset_m"] == pytest.approx(0.237, abs=2.0 * result["sd_m"])
@@ -148,22 +145,18 @@ def test_los_of_the_real_logs_gives_the_offset_of_the_boards(apartment_imported:
 def test_written_offsets_are_read_by_the_other_commands(direct: list[Record], tmp_path: Path):
     write_records(tmp_path / "los.mcap", longer(direct[:300], 0.5))
     asked = ("offset", "los.mcap", "--truth", "-o", "o.yaml")
-    assert command_line.run(*asked, folder=tmp_path).returncode == 0
-    again = command_line.run(*asked, folder=tmp_path)
+    succeed(*asked, folder=tmp_path)
+    again = run(*asked, folder=tmp_path)
     assert (again.returncode, "--force" in again.stderr) == (2, True)
-    assert command_line.run(*asked, "--force", folder=tmp_path).returncode == 0
+    succeed(*asked, "--force", folder=tmp_path)
     errors = {}
-    for name, options in {
-        "without": (),
-        "with": ("--offsets", "o.yaml"),
-        "number": ("--offsets", "0.5"),
-    }.items():
-        done = command_line.run("evaluate --data los.mcap", *options, "--json", "e.json", folder=tmp_path)
-        assert done.returncode == 0, done.stderr
-        errors[name] = json.loads((tmp_path / "e.json").read_text())["corrected"]["mae"]
-    assert errors["with"] < 0.5 * errors["without"]
-    assert errors["number"] < errors["without"]
-    wrong = command_line.run("evaluate", "--data", "los.mcap", "--offsets", "220", folder=tmp_path)
+    for offsets in ("0", "o.yaml", "0.5"):
+        words = f"evaluate --data los.mcap --offsets {offsets} --json e.json"
+        succeed(words, folder=tmp_path)
+        errors[offsets] = json.loads((tmp_path / "e.json").read_text())["corrected"]["mae"]
+    assert errors["o.yaml"] < 0.5 * errors["0"]
+    assert errors["0.5"] < errors["0"]
+    wrong = run("evaluate", "--data", "los.mcap", "--offsets", "220", folder=tmp_path)
     assert wrong.returncode != 0
     assert "millimetres" in wrong.stderr
 
@@ -178,7 +171,7 @@ def test_written_offsets_are_read_by_the_other_commands(direct: list[Record], tm
     ],
 )
 def test_contradictory_options_are_refused_early(options: tuple[str, ...], excerpt: str, tmp_path: Path):
-    outcome = command_line.run("offset", "none.mcap", *options, folder=tmp_path)
+    outcome = run("offset", "none.mcap", *options, folder=tmp_path)
     assert outcome.returncode != 0
     assert excerpt in outcome.stderr
 

@@ -436,6 +436,10 @@ def test_all_candidate_positions_are_found():
             anchors, np.linalg.norm(anchors - tag, axis=1), np.full(4, 0.1), NoiseModel(), height=Height(1.0)
         )
         assert min(np.linalg.norm(place.position - tag) for place in found) < 0.05
+    line = np.array([[0.0, 0, 1], [4, 0, 1], [9, 0, 1]])
+    range_m, sd_m = np.linalg.norm(line - (3, 2, 1), axis=1), np.full(3, 0.1)
+    found = candidate_positions(line, range_m, sd_m, NoiseModel(), height=Height(1.0))
+    assert sorted(round(float(place.position[1])) for place in found) == [-2, 2]
 
 
 def test_the_best_position_on_a_wall_is_found_if_the_optimum_is_outside():

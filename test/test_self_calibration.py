@@ -40,21 +40,11 @@ def recorded():
     return drive(seconds=80, rate_hz=10.0, offset_m=0.25)
 
 
-@pytest.fixture(scope="module")
-def solved(recorded):
-    return self_calibrate(HALL, [with_own(recorded[0])], height=LEVEL)
-
-
-def test_pair_offsets_of_a_drive_match_their_standard_deviations(solved):
-    found = np.array([solved.pair(0, row) for row in range(5)])
-    error = found[:, 0] - 0.25 - OWN
-    assert np.abs(error).max() < 0.12
-    assert np.abs(error / found[:, 1]).max() < 3.0
-
-
-def test_pseudo_truth_uses_the_other_anchors_and_has_a_standard_deviation(solved, recorded):
+def test_pseudo_truth_uses_the_other_anchors_and_has_a_standard_deviation(recorded):
     ranges, path = recorded
     truth = distances(path, ranges)
+    solved = self_calibrate(HALL, [with_own(ranges)], height=LEVEL)
+    assert [solved.pair(0, row)[0] for row in range(5)] == pytest.approx(OWN + 0.25, abs=0.12)
     error = solved.distance_m - truth
     assert np.isfinite(error).all()
     assert np.abs(error).mean() < 0.1
@@ -166,22 +156,24 @@ def test_track_with_two_mirror_images_is_refused():
     refused("mirror images", HALL.moved(flat, HALL.sd), [ranges])
 
 
-@pytest.mark.parametrize(("row", "by"), [(3, (3.0, -2.5, 0.0)), (4, (1.5, 0.0, 0.0))])
-def test_moved_anchor_is_named_by_its_id(recorded, row, by):
-    wrong = HALL.position.copy()
-    wrong[row] += by
-    refused(f"anchor {row + 1} contradicts", HALL.moved(wrong, HALL.sd), [recorded[0]], height=LEVEL)
+@pytest.mark.parametrize(
+    ("rows", "places", "named"),
+    [
+        ([3], (3.0, 6.5, 0.5), "anchor 4 contradicts"),
+        ([4], (7.5, 0.0, 1.5), "anchor 5 contradicts"),
+        ([0, 2], HALL.position[[2, 0]], "anchors 1 and 3 contradict"),
+    ],
+)
+def test_anchors_at_wrong_positions_are_named_by_their_ids(recorded, rows, places, named):
+    position = HALL.position.copy()
+    position[rows] = places
+    some = recorded[0].take(np.arange(0, len(recorded[0]), 4 if len(rows) > 1 else 1))
+    refused(named, HALL.moved(position, HALL.sd), [some], height=LEVEL)
 
 
 def test_ranges_in_feet_are_refused(recorded):
     feet = replace(recorded[0], range_m=recorded[0].range_m / 0.3048)
     refused("if the ranges were in feet", HALL, [feet], height=LEVEL)
-
-
-def test_two_swapped_opposite_anchors_are_named(recorded):
-    swapped = HALL.moved(HALL.position[[2, 1, 0, 3, 4]], HALL.sd)
-    some = recorded[0].take(np.arange(0, len(recorded[0]), 4))
-    refused("anchors 1 and 3 contradict", swapped, [some], height=LEVEL)
 
 
 def test_positions_of_a_carried_tag_without_pauses_are_refused():

@@ -44,12 +44,6 @@ def drive() -> list[Record]:
     return list(SimulatedSource(seed=3, count=1500))
 
 
-def errors_of(records: list[Record], label: str) -> np.ndarray:
-    return np.array(
-        [r.measurement.range_m - r.truth.range_m for r in records if r.truth and r.truth.label == label]
-    )
-
-
 def test_same_seed_gives_the_same_measurements() -> None:
     endless = SimulatedSource(seed=5, rate_hz=333.0, tags=2)
     first = [values(r) for r in itertools.islice(endless, 90)]
@@ -78,16 +72,9 @@ def test_exchanges_that_are_not_received_are_counted() -> None:
 
 
 def test_line_of_sight_errors_centre_on_the_offset(drive: list[Record]) -> None:
-    error = errors_of(drive, "LOS")
+    error = [r.measurement.range_m - r.truth.range_m for r in drive if r.truth and r.truth.label == "LOS"]
     assert np.median(error) == pytest.approx(Receiver().range_offset_m, abs=0.02)
     assert np.percentile(error, 75) - np.percentile(error, 25) < 0.06
-
-
-def test_obstacles_and_lost_direct_paths_lengthen_ranges(drive: list[Record]) -> None:
-    los, nlos, ndp = (errors_of(drive, label) for label in ("LOS", "NLOS", "NDP NLOS"))
-    assert min(len(los), len(nlos), len(ndp)) >= 20
-    assert los.mean() + 0.1 < nlos.mean() < ndp.mean()
-    assert nlos.mean() - 0.22 == pytest.approx(0.35, abs=0.25)
 
 
 def test_levels_are_of_the_order_of_real_logs(drive: list[Record]) -> None:
