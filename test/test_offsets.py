@@ -127,14 +127,10 @@ def subject(tmp_path_factory) -> Mitigation:
     return Mitigation(bundle(tmp_path_factory.mktemp("bundle"), Remnet(samples=157)))
 
 
-def with_offsets(subject: Mitigation, offsets: Offsets) -> Mitigation:
-    return Mitigation(subject.bundle, offsets)
-
-
 def test_offset_is_subtracted_in_addition_to_the_predicted_error(subject: Mitigation):
     offset = 0.25
     plain, moved = subject.correct([measurement(3.0)])[0], measurement(3.25)
-    result = with_offsets(subject, Offsets(offset)).correct([moved])[0]
+    result = Mitigation(subject.bundle, Offsets(offset)).correct([moved])[0]
     assert result.status is Status.OK
     assert result.range_raw_m == 3.25
     assert result.correction_m == pytest.approx(plain.correction_m + offset, abs=1e-6)
@@ -157,7 +153,7 @@ def test_passed_through_range_has_the_offset_subtracted(
 ):
     bad = measurement(range_m)
     bad = replace(bad, cir=replace(bad.cir, preamble_count=0))
-    result = with_offsets(subject, Offsets(offset)).correct([bad])[0]
+    result = Mitigation(subject.bundle, Offsets(offset)).correct([bad])[0]
     assert result.status is Status.BAD_CIR
     assert str(result.range_m) == str(expected)
     assert result.correction_m == offset

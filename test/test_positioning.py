@@ -309,14 +309,11 @@ def lagged(
     anchors: AnchorMap, ranges: Ranges, truth: TruePath, area: Area | None = None, heights: bool = False
 ) -> tuple[Track, Track]:
     """Return the live track of a fleet, and the one that is smoothed with a lag."""
-    fleet, live, smoothed = (
-        MultiTagEstimator(EstimatorConfig(anchors, NoiseModel(), area=area)),
-        list[Estimate](),
-        list[Estimate](),
-    )
-    columns = (ranges.stamp_ns, ranges.anchor, ranges.range_m)
-    for i, (stamp_ns, row, range_m) in enumerate(zip(*(one.tolist() for one in columns), strict=True)):
-        found = fleet.add(7, row + 1, stamp_ns, range_m, 0.01)
+    fleet = MultiTagEstimator(EstimatorConfig(anchors, NoiseModel(), area=area))
+    live, smoothed = list[Estimate](), list[Estimate]()
+    for i in range(len(ranges)):
+        range_m = float(ranges.range_m[i])
+        found = fleet.add(7, int(ranges.anchor[i]) + 1, int(ranges.stamp_ns[i]), range_m, 0.01)
         assert found is not None
         tag, estimate = found
         if heights:
@@ -341,19 +338,15 @@ def test_fixed_lag_poses_obey_area_and_measured_heights():
     assert with_heights < 0.03 < without
 
 
-@pytest.mark.parametrize("seed", [1, 3])
-def test_fixed_lag_poses_among_obstacles_are_not_worse_than_live(seed: int):
+@pytest.mark.parametrize(
+    ("seed", "constant_m"), [(1, (0.0,) * 5), (3, (0.0,) * 5), (1, (0.4, 0.0, 0.1, -0.1, 0.5))]
+)
+def test_fixed_lag_poses_among_obstacles_are_not_worse_than_live(seed: int, constant_m: tuple[float, ...]):
     ranges, truth = drive(seconds=30, seed=seed)
-    live, smoothed = (track_errors(one, truth) for one in lagged(HALL, block(ranges, seed), truth))
-    assert smoothed.rmse < 1.1 * live.rmse
-    assert smoothed.coverage95 > 0.85
-
-
-def test_fixed_lag_covariances_contain_constant_errors_as_live_ones_do():
-    ranges, truth = drive(seconds=30, seed=1)
-    block(ranges, 1).range_m[:] += np.array([0.4, 0.0, 0.1, -0.1, 0.5])[ranges.anchor]
+    block(ranges, seed).range_m[:] += np.array(constant_m)[ranges.anchor]
     live, smoothed = (track_errors(one, truth) for one in lagged(HALL, ranges, truth))
-    assert smoothed.coverage95 > live.coverage95 - 0.05
+    assert smoothed.rmse < 1.1 * live.rmse
+    assert smoothed.coverage95 > max(0.85, live.coverage95 - 0.05)
 
 
 @pytest.mark.parametrize("seed", [0, 3])

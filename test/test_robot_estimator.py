@@ -161,6 +161,15 @@ def test_estimates_stay_inside_the_area():
     assert area.holds(track.position).all()
 
 
+def test_antenna_is_projected_onto_the_area():
+    one, area = _filter(), Area((0.0, 0.0, 0.0), (4.5, 3.5, 1.0))
+    assert math.dist(one.antenna, (4.5, 3.5, 1.0)) > 0.4
+    one.confine(area)
+    # The projection also turns the robot a little, and its lever arm.
+    assert one.antenna == pytest.approx((4.5, 3.5, 1.0), abs=0.05)
+    assert np.max(np.subtract(one.antenna, area.high)) < 1e-9
+
+
 HUGE = (math.nan, math.inf, -math.inf, 1e300, -1e300, 1e38, 1e9, 1e5, 0.0, -1.0, 1e-300)
 
 
