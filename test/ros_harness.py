@@ -17,7 +17,9 @@ from typing import Any
 
 import pytest
 import rclpy
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from drives import HALL
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.msg import SetParametersResult
@@ -28,9 +30,11 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
-from uwb_mitigation_msgs.msg import RangeCir
+from std_msgs.msg import Header
+from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
-from uwb_mitigation.types.stamps import to_ns
+from uwb_mitigation.types.stamps import NS_PER_S, to_ns
+from uwb_mitigation.types.tracks import Ranges
 
 TIMEOUT_S, RESPONSE_TIMEOUT_S = 240.0, 20.0
 STATE_AFTER = {
@@ -56,6 +60,22 @@ os.environ |= {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_PYTHON_CHECK_F
 def diagnostic_values(status: DiagnosticStatus) -> dict[str, str]:
     """Return the values of a diagnostic status."""
     return {diagnostic_value.key: diagnostic_value.value for diagnostic_value in status.values}
+
+
+def header_at(time_ns: int, frame: str = "") -> Header:
+    """Return a header with a stamp."""
+    return Header(stamp=Time(sec=time_ns // NS_PER_S, nanosec=time_ns % NS_PER_S), frame_id=frame)
+
+
+def corrected_range(ranges: Ranges, row: int, header: Header, **changes: object) -> RangeCorrected:
+    """Return a range of a drive past `HALL` as a message."""
+    values = {
+        "tag_id": 7,
+        "anchor_id": HALL.anchors[ranges.anchor[row]].id,
+        "sequence": row,
+        "variance": 0.01,
+    }
+    return RangeCorrected(header=header, **values | {"range": float(ranges.range_m[row])} | changes)
 
 
 def set_expiry(monkeypatch: pytest.MonkeyPatch, folder: Path, seconds: int) -> None:

@@ -11,13 +11,12 @@ import pytest
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
-from builtin_interfaces.msg import Time
 from drives import HALL
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
-from ros_harness import Ros
+from ros_harness import Ros, header_at
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
@@ -26,6 +25,7 @@ from uwb_mitigation_msgs.msg import RangeCorrected
 from uwb_mitigation.recordings.bag.odometry import encode_imu_row, encode_odometry_row, encode_transform_row
 from uwb_mitigation.simulation.odometry import RATE_HZ, simulate_motion
 from uwb_mitigation.types.ros.poses import yaw_of
+from uwb_mitigation.types.stamps import to_ns
 
 pytestmark = pytest.mark.ros
 
@@ -43,9 +43,9 @@ class Buffer:
     def add(self, transform: TransformStamped) -> None:
         child, parent = transform.child_frame_id, transform.header.frame_id
         assert self.parents.setdefault(child, parent) == parent, f"{child} has two parents"
-        stamp, at = transform.header.stamp, transform.transform.translation
+        at = transform.transform.translation
         pose = at.x, at.y, yaw_of(transform.transform.rotation)
-        self.poses.setdefault(child, {})[stamp.sec * 10**9 + stamp.nanosec] = pose
+        self.poses.setdefault(child, {})[to_ns(transform.header.stamp)] = pose
 
     def lookup(self, target: str, source: str, stamp: int) -> np.ndarray | None:
         """Return x, y and yaw of the source frame in the target frame; None: the lookup fails."""
@@ -101,7 +101,7 @@ def test_no_lookup_fails_and_the_yaw_error_fits_its_variance(ros: Ros, anchors: 
 
     for step in range(round(SECONDS * RATE_HZ) // 5):
         rows = range(5 * step, 5 * step + 5)
-        at = [Time(sec=int(stamps[row] // 10**9), nanosec=int(stamps[row] % 10**9)) for row in rows]
+        at = [header_at(int(stamps[row])).stamp for row in rows]
         for row, (publisher, kind, encode, data) in itertools.product(rows, robot):
             message = deserialize_message(encode(data, row), kind)
             for stamped in getattr(message, "transforms", [message]):

@@ -11,20 +11,18 @@ import pytest
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
-from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray
 from drives import HALL, NANOSECONDS, drive
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
-from ros_harness import Ros, diagnostic_values
+from ros_harness import Ros, corrected_range, diagnostic_values, header_at
 from rosgraph_msgs.msg import Clock
-from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 from uwb_mitigation_msgs.msg import RangeCorrected
 from visualization_msgs.msg import MarkerArray
 
 from uwb_mitigation.types.anchors import dump_anchors
+from uwb_mitigation.types.stamps import to_ns
 
 pytestmark = pytest.mark.ros
 
@@ -44,21 +42,10 @@ class Drive:
         # Its first poses would be lost.
         ros.wait_until_active("locator")
 
-    def send(self, rows: range, tag: int = 7, **changes) -> None:
+    def send(self, rows: range, **changes) -> None:
         for i in rows:
-            stamp = self.start_ns + int(self.ranges.stamp_ns[i])
-            message = RangeCorrected(
-                header=Header(stamp=Time(sec=stamp // NANOSECONDS, nanosec=stamp % NANOSECONDS)),
-                tag_id=tag,
-                anchor_id=HALL.anchors[self.ranges.anchor[i]].id,
-                sequence=i,
-                range=float(self.ranges.range_m[i]),
-                range_raw=float(self.ranges.range_m[i]),
-                variance=0.01,
-            )
-            for name, value in changes.items():
-                setattr(message, name, value)
-            self._publisher.publish(message)
+            header = header_at(self.start_ns + int(self.ranges.stamp_ns[i]))
+            self._publisher.publish(corrected_range(self.ranges, i, header, **changes))
             if i % 50 == 0:
                 self._ros.spin_for(0.01)
 
@@ -70,16 +57,7 @@ class Drive:
 
 
 def stamp_ns(pose: PoseWithCovarianceStamped) -> int:
-    return pose.header.stamp.sec * NANOSECONDS + pose.header.stamp.nanosec
-
-
-def values(received: list[DiagnosticArray]) -> dict[str, str]:
-    """Return the values of the latest status of the locator, with its message as value of an empty key."""
-    for array in reversed(received):
-        for status in array.status:
-            if status.name.startswith("locator"):
-                return diagnostic_values(status) | {"": status.message}
-    return {}
+    return to_ns(pose.header.stamp)
 
 
 def test_ranges_yield_poses_odometry_smoothed_poses_and_markers(ros: Ros, anchors: Path):
@@ -88,7 +66,6 @@ def test_ranges_yield_poses_odometry_smoothed_poses_and_markers(ros: Ros, anchor
     poses = ros.collect(PoseWithCovarianceStamped, "/uwb/pose")
     odometry = ros.collect(Odometry, "/uwb/odometry")
     smoothed = ros.collect(PoseWithCovarianceStamped, "/uwb/pose_smoothed")
-    diagnostics = ros.collect(DiagnosticArray, "/diagnostics")
     second = ros.collect(PoseWithCovarianceStamped, "/uwb/tag_9/pose")
     run = Drive(ros, seconds=20)
     half = len(run.ranges) // 2
@@ -98,8 +75,9 @@ def test_ranges_yield_poses_odometry_smoothed_poses_and_markers(ros: Ros, anchor
     run.send(range(half, half + 3), range=math.nan)
     run.send(range(half, half + 3), anchor_id=4711)
     run.send(range(half, len(run.ranges)))
-    run.send(range(half), tag=9)
-    ros.spin_until(lambda: len(second) > 20 and values(diagnostics).get("ranges of unknown anchors") == "3")
+    run.send(range(half), tag_id=9)
+    ros.spin_until(lambda: len(second) > 20)
+    status = ros.diagnosis("locator", lambda s: diagnostic_values(s).get("ranges of unknown anchors") == "3")
     moving = [pose for pose in poses if stamp_ns(pose) < run.start_ns + 18 * NANOSECONDS]
     errors = run.errors(moving)
     known = np.isfinite(errors)
@@ -110,9 +88,8 @@ def test_ranges_yield_poses_odometry_smoothed_poses_and_markers(ros: Ros, anchor
     assert {message.child_frame_id for message in odometry} == {"uwb_tag"}
     assert poses[-1].pose.covariance[35] >= 1e5
     assert poses[-1].pose.pose.orientation.w == 1.0
-    reported = values(diagnostics)
+    reported = diagnostic_values(status)
     assert reported["ranges not valid"] == "3"
-    assert reported["ranges of unknown anchors"] == "3"
     assert float(reported["tag 7 HDOP"]) < 3
     assert reported["tag 7 determination"].startswith("unique: HDOP")
     assert "anchor 4711 are left out" in locator.output
@@ -139,7 +116,7 @@ def test_gap_is_bridged_by_predictions_with_growing_covariance(ros: Ros, anchors
     def spread_at(row: int, silent_s: float) -> float:
         """Return the variance reported at the given time after a range."""
         now_ns = run.start_ns + int(run.ranges.stamp_ns[row]) + round(silent_s * NANOSECONDS)
-        now = Clock(clock=Time(sec=now_ns // NANOSECONDS, nanosec=now_ns % NANOSECONDS))
+        now = Clock(clock=header_at(now_ns).stamp)
 
         def variances() -> list[float]:
             return [pose.pose.covariance[0] for pose in poses if stamp_ns(pose) == now_ns]
@@ -162,8 +139,7 @@ def test_missing_anchors_file_is_reported_by_the_node(ros: Ros, tmp_path: Path):
     excerpt = "no such file"
     locator = ros.start("locator", f"anchors:={tmp_path / 'anchors.yaml'}")
     locator.wait_for_output(excerpt)
-    diagnostics = ros.collect(DiagnosticArray, "/diagnostics")
-    ros.spin_until(lambda: excerpt in values(diagnostics).get("", ""))
+    ros.diagnosis("locator", lambda status: excerpt in status.message)
     assert locator.exit_code() is None
     assert locator.signal(signal.SIGINT) == 0
 
@@ -190,7 +166,8 @@ def test_tf_contains_only_the_frames_of_the_tags_below_the_map(ros: Ros, anchors
         process.wait_for_output("locating")
     transforms, left_transforms = ros.collect(TFMessage, "/tf"), ros.collect(TFMessage, "/left/tf")
     poses = ros.collect(PoseWithCovarianceStamped, "/uwb/pose")
-    long_tag = "tag_0x1122334455667788"
+    long_id = 0x1122334455667788
+    long_tag = f"tag_{long_id:#x}"
     odometry = {
         frame: ros.collect(Odometry, topic)
         for frame, topic in (
@@ -205,7 +182,7 @@ def test_tf_contains_only_the_frames_of_the_tags_below_the_map(ros: Ros, anchors
     for step in range(0, len(run.ranges), 20):
         rows = range(step, min(step + 20, len(run.ranges)))
         run.send(rows)
-        run.send(rows, tag=0x1122334455667788)
+        run.send(rows, tag_id=long_id)
     ros.spin_until(lambda: all(len(messages) > 20 for messages in odometry.values()))
 
     def links() -> dict[tuple[str, int], TransformStamped]:

@@ -16,8 +16,7 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray
-from drives import HALL, NANOSECONDS, Robot, wrapped
+from drives import NANOSECONDS, Robot, wrapped
 from geometry_msgs.msg import (
     PoseWithCovarianceStamped,
     Quaternion,
@@ -27,8 +26,9 @@ from geometry_msgs.msg import (
     Vector3,
 )
 from nav_msgs.msg import Odometry
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from ros_harness import Ros, diagnostic_values, set_expiry
+from ros_harness import Process, Ros, corrected_range, diagnostic_values, header_at, set_expiry
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Header
@@ -41,6 +41,7 @@ from uwb_mitigation.nodes.robot_motion import MotionState, OdometryInput
 from uwb_mitigation.nodes.support.parameter_tables import RESPAWN_FOLDER
 from uwb_mitigation.positioning.online.dead_reckoning import DeadReckoning
 from uwb_mitigation.types.ros.poses import yaw_of
+from uwb_mitigation.types.stamps import to_ns
 from uwb_mitigation.types.tracks import Estimate, Heading
 
 pytestmark = pytest.mark.ros
@@ -54,7 +55,20 @@ CHUNK_S = 0.2
 
 
 def stamp_ns(header: Header) -> int:
-    return header.stamp.sec * NANOSECONDS + header.stamp.nanosec
+    return to_ns(header.stamp)
+
+
+def link(parent: str, child: str, rotation: Quaternion, **at_m: float) -> TransformStamped:
+    """Return the transform of a frame in its parent."""
+    transform = Transform(translation=Vector3(**at_m), rotation=rotation)
+    return TransformStamped(header=Header(frame_id=parent), child_frame_id=child, transform=transform)
+
+
+def send_static(ros: Ros, topic: str, transforms: list[TransformStamped]) -> Publisher:
+    qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    publisher = ros.node.create_publisher(TFMessage, topic, qos)
+    publisher.publish(TFMessage(transforms=transforms))
+    return publisher
 
 
 class LiveRobot:
@@ -81,7 +95,7 @@ class LiveRobot:
         self.odometry = ros.collect(Odometry, f"{namespace}/uwb/odometry")
         self.transforms = ros.collect(TFMessage, f"{namespace}/tf")
         self._namespace = namespace
-        self.diagnostics = ros.collect(DiagnosticArray, "/diagnostics")
+        self.wait()
 
     def wait(self) -> None:
         self._ros.wait_for_subscribers(f"{self._namespace}/uwb/range_corrected", 1)
@@ -89,8 +103,7 @@ class LiveRobot:
         self._ros.wait_until_active(f"{self._namespace}/locator".removeprefix("/"))
 
     def header(self, stamp: int, frame: str = "") -> Header:
-        stamp += self.start_ns
-        return Header(stamp=Time(sec=stamp // NANOSECONDS, nanosec=stamp % NANOSECONDS), frame_id=frame)
+        return header_at(self.start_ns + stamp, frame)
 
     def play(self, until_s: float, *, odometry: bool = True, tags: tuple[int, ...] = (7,)) -> None:
         while self._at_s < until_s - CHUNK_S / 2:
@@ -116,16 +129,8 @@ class LiveRobot:
     def send_range(self, row: int, tag: int = 7) -> None:
         # The first ranges are in no frame.
         frame = "uwb_antenna" if self._at_s > 1.0 else ""
-        self._ranges_out.publish(
-            RangeCorrected(
-                header=self.header(int(self.ranges.stamp_ns[row]), frame),
-                tag_id=tag,
-                anchor_id=HALL.anchors[self.ranges.anchor[row]].id,
-                sequence=row,
-                range=float(self.ranges.range_m[row]),
-                variance=0.01,
-            )
-        )
+        header = self.header(int(self.ranges.stamp_ns[row]), frame)
+        self._ranges_out.publish(corrected_range(self.ranges, row, header, tag_id=tag))
 
     def send_odometry(self, begin_s: float, end_s: float) -> None:
         measured, begin, end = self.robot.odometry, *(round(s * NANOSECONDS) for s in (begin_s, end_s))
@@ -152,12 +157,9 @@ class LiveRobot:
                 imu.angular_velocity.z, imu.angular_velocity_covariance[0] = 9.0, -1.0
                 self._imu_out.publish(imu)
 
-    def values(self) -> dict[str, str]:
-        for array in reversed(self.diagnostics):
-            for status in array.status:
-                if status.name.startswith("locator"):
-                    return diagnostic_values(status) | {"": status.message}
-        return {"": ""}
+    def transform_ns(self) -> int:
+        """Return the stamp of the latest transform."""
+        return stamp_ns(self.transforms[-1].transforms[0].header)
 
     def poses_between(self, begin_s: float, end_s: float) -> list[PoseWithCovarianceStamped]:
         limits = [self.start_ns + round(s * NANOSECONDS) for s in (begin_s, end_s)]
@@ -172,39 +174,26 @@ class LiveRobot:
         return np.hypot(*away.T), wrapped(yaw - self.robot.yaw(time_s))
 
 
-def start(ros: Ros, anchors: Path, *parameters: str):
-    height = f"height:={1.0 + LEVER[2]}"
-    return ros.start(
-        "locator",
-        f"anchors:={anchors}",
-        "rate:=0.0",
-        "level:=true",
-        height,
-        "odometry:=/odom",
-        *(one.format("") for one in RELIABLE),
-        *parameters,
-    )
+def start(ros: Ros, anchors: Path, *parameters: str, namespace: str = "") -> Process:
+    """Start a locator and wait until it is ready."""
+    given = f"anchors:={anchors}", "rate:=0.0", "level:=true", f"height:={1.0 + LEVER[2]}", "odometry:=odom"
+    reliable = [one.format(namespace) for one in RELIABLE]
+    arguments = ("-r", f"__ns:={namespace}") if namespace else ()
+    locator = ros.start("locator", *given, *reliable, *parameters, arguments=arguments)
+    locator.wait_for_output("locating")
+    return locator
 
 
 def test_modes_ranges_only_odometry_odometry_lost_and_odometry_wrong(ros: Ros, anchors: Path):
-    static = ros.node.create_publisher(
-        TFMessage, "/tf_static", QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    )
     # The antenna is on a mast that is turned by 90 degrees; the quaternion is not quite normalised.
-    mast = TransformStamped(child_frame_id="mast", header=Header(frame_id="base_link"))
-    mast.transform = Transform(translation=Vector3(x=0.1), rotation=Quaternion(z=0.74, w=0.74))
-    antenna = TransformStamped(child_frame_id="uwb_antenna", header=Header(frame_id="mast"))
-    antenna.transform = Transform(translation=Vector3(x=0.1, y=-0.2, z=0.2), rotation=Quaternion(w=1.0))
+    mast = link("base_link", "mast", Quaternion(z=0.74, w=0.74), x=0.1)
+    antenna = link("mast", "uwb_antenna", Quaternion(w=1.0), x=0.1, y=-0.2, z=0.2)
     # Transforms that are not rotations are skipped.
-    invalid = [
-        TransformStamped(child_frame_id="mast", header=mast.header, transform=Transform(rotation=rotation))
-        for rotation in (Quaternion(w=0.0), Quaternion(w=2.0), Quaternion(x=math.nan, w=1.0))
-    ]
-    static.publish(TFMessage(transforms=[antenna, mast, *invalid]))
+    not_rotations = Quaternion(w=0.0), Quaternion(w=2.0), Quaternion(x=math.nan, w=1.0)
+    invalid = [link("base_link", "mast", rotation) for rotation in not_rotations]
+    static = send_static(ros, "/tf_static", [antenna, mast, *invalid])
     locator = start(ros, anchors, "publish_tf:=true", "transform_tolerance:=1.0")
-    locator.wait_for_output("locating")
     live = LiveRobot(ros, seconds=44.0, slip=(40.0, 44.0))
-    live.wait()
     ros.spin_until(lambda: static.get_subscription_count() == 1)
 
     live.play(3.0, odometry=False)
@@ -234,35 +223,27 @@ def test_modes_ranges_only_odometry_odometry_lost_and_odometry_wrong(ros: Ros, a
     lost = live.poses_between(25.0, 30.0)
     assert all(pose.pose.covariance[35] >= UNKNOWN_YAW for pose in lost)
     assert np.sqrt(np.mean(live.errors(lost)[0] ** 2)) < 0.6
-    ros.spin_until(lambda: "no odometry" in live.values()[""])
+    ros.diagnosis("locator", lambda status: "no odometry" in status.message)
     # The last transform is repeated with new stamps.
     last_ns = stamp_ns(live.poses[-1].header) + NANOSECONDS
-    ros.spin_until(lambda: stamp_ns(live.transforms[-1].transforms[0].header) == last_ns)
+    ros.spin_until(lambda: live.transform_ns() == last_ns)
 
     live.play(40.0)
     distance, of_yaw = live.errors(live.poses_between(38.0, 40.0))
     assert np.sqrt(np.mean(of_yaw**2)) < math.radians(6.0)
-    ros.spin_until(lambda: live.values().get("tag 7 heading") == "known")
+    ros.diagnosis("locator", lambda status: diagnostic_values(status).get("tag 7 heading") == "known")
 
     # The wheels slip.
     live.play(44.0)
     assert live.odometry[-1].twist.covariance[0] >= 1e5
     assert live.odometry[-1].twist.twist.linear.x == 0.0
-    ros.spin_until(lambda: "odometry contradicts the ranges" in live.values()[""])
+    ros.diagnosis("locator", lambda status: "odometry contradicts the ranges" in status.message)
 
 
 def test_lever_arm_of_the_parameters_and_yaw_rates_of_an_imu(ros: Ros, anchors: Path):
-    locator = start(
-        ros,
-        anchors,
-        "lever_arm:=0.3,0.1,0.2",
-        "imu:=/imu",
-        "imu_orientation:=true",
-        "base_frame:=base_footprint",
-    )
-    locator.wait_for_output("locating")
+    parameters = ("imu:=/imu", "imu_orientation:=true", "base_frame:=base_footprint")
+    start(ros, anchors, "lever_arm:=0.3,0.1,0.2", *parameters)
     live = LiveRobot(ros, seconds=20.0, imu=True)
-    live.wait()
     others = ros.collect(PoseWithCovarianceStamped, "/uwb/tag_9/pose")
     live.play(18.0)
     live.play(20.0, tags=(7, 9))
@@ -278,22 +259,11 @@ def test_lever_arm_of_the_parameters_and_yaw_rates_of_an_imu(ros: Ros, anchors: 
 
 
 def test_namespace_contains_the_topics_and_transforms_of_a_robot(ros: Ros, anchors: Path):
-    qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    static = ros.node.create_publisher(TFMessage, "/robot1/tf_static", qos)
-    antenna = TransformStamped(child_frame_id="uwb_antenna", header=Header(frame_id="base_link"))
-    antenna.transform = Transform(
-        translation=Vector3(x=LEVER[0], y=LEVER[1], z=LEVER[2]), rotation=Quaternion(w=1.0)
-    )
-    static.publish(TFMessage(transforms=[antenna]))
-    parameters = (f"anchors:={anchors}", "level:=true", f"height:={1.0 + LEVER[2]}", "odometry:=odom")
-    parameters += (RELIABLE[0].format("/robot1"),)
-    locator = ros.start(
-        "locator", *parameters, "rate:=0.0", "publish_tf:=true", arguments=("-r", "__ns:=/robot1")
-    )
-    locator.wait_for_output("locating")
+    antenna = link("base_link", "uwb_antenna", Quaternion(w=1.0), x=0.3, y=0.1, z=0.2)
+    send_static(ros, "/robot1/tf_static", [antenna])
+    locator = start(ros, anchors, "publish_tf:=true", namespace="/robot1")
     elsewhere = ros.collect(TFMessage, "/tf")
     live = LiveRobot(ros, seconds=16.0, namespace="/robot1")
-    live.wait()
     live.play(16.0)
     assert "lever arm of the antenna: 0.300, 0.100, 0.200" in locator.output
     (links,) = {
@@ -307,31 +277,25 @@ def test_namespace_contains_the_topics_and_transforms_of_a_robot(ros: Ros, ancho
 
 
 def test_transform_is_repeated_while_there_is_no_position(ros: Ros, anchors: Path):
-    locator = start(ros, anchors, "lever_arm:=0.3,0.1,0.2", "publish_tf:=true", "use_sim_time:=true")
-    locator.wait_for_output("locating")
+    start(ros, anchors, "lever_arm:=0.3,0.1,0.2", "publish_tf:=true", "use_sim_time:=true")
     clock = ros.node.create_publisher(Clock, "/clock", 10)
     live = LiveRobot(ros, seconds=25.0)
-    live.wait()
     live.play(16.0)
     # One range after a gap does not determine a position.
     live.send_range(len(live.ranges) - 1)
     ros.state_of("locator")
     now = live.header(25 * NANOSECONDS)
-    ros.spin_until(
-        lambda: clock.publish(Clock(clock=now.stamp)) or live.values().get("tag 7 candidates") == "0"
-    )
     expected = stamp_ns(now) + NANOSECONDS
-    ros.spin_until(lambda: stamp_ns(live.transforms[-1].transforms[0].header) == expected)
+    ros.spin_until(lambda: clock.publish(Clock(clock=now.stamp)) or live.transform_ns() == expected)
+    ros.diagnosis("locator", lambda status: diagnostic_values(status).get("tag 7 candidates") == "0")
     assert stamp_ns(live.poses[-1].header) < live.start_ns + 16 * NANOSECONDS
 
 
 def test_predictions_and_transforms_end_30_s_after_the_last_range(ros: Ros, anchors: Path):
-    locator = start(ros, anchors, "lever_arm:=0.3,0.1,0.2", "publish_tf:=true", "use_sim_time:=true")
-    locator.wait_for_output("locating")
+    start(ros, anchors, "lever_arm:=0.3,0.1,0.2", "publish_tf:=true", "use_sim_time:=true")
     clock = ros.node.create_publisher(Clock, "/clock", 10)
     markers = ros.collect(MarkerArray, "/uwb/anchors")
     live = LiveRobot(ros, seconds=16.0)
-    live.wait()
     live.play(16.0)
 
     def wait_for_timer(seconds: float) -> int:
@@ -347,12 +311,12 @@ def test_predictions_and_transforms_end_30_s_after_the_last_range(ros: Ros, anch
 
     predicted_ns = wait_for_timer(16.35)
     ros.spin_until(lambda: stamp_ns(live.poses[-1].header) == predicted_ns)
-    ros.spin_until(lambda: stamp_ns(live.transforms[-1].transforms[0].header) == predicted_ns + NANOSECONDS)
+    ros.spin_until(lambda: live.transform_ns() == predicted_ns + NANOSECONDS)
     for seconds in (46.2, 46.3, 46.4):
         wait_for_timer(seconds)
     ros.spin_for(0.2)
     assert stamp_ns(live.poses[-1].header) == predicted_ns
-    assert stamp_ns(live.transforms[-1].transforms[0].header) == predicted_ns + NANOSECONDS
+    assert live.transform_ns() == predicted_ns + NANOSECONDS
 
 
 def test_respawned_locator_continues_with_transform_and_heading(
@@ -362,10 +326,8 @@ def test_respawned_locator_continues_with_transform_and_heading(
     set_expiry(monkeypatch, tmp_path, 5)
     parameters = ("lever_arm:=0.3,0.1,0.2", "publish_tf:=true", "use_sim_time:=true")
     locator = start(ros, anchors, *parameters)
-    locator.wait_for_output("locating")
     clock = ros.node.create_publisher(Clock, "/clock", 10)
     live = LiveRobot(ros, seconds=28.0)
-    live.wait()
     live.play(16.0)
     (tmp_path / "locator.state").unlink(missing_ok=True)
     ros.spin_until((tmp_path / "locator.state").exists)
@@ -404,18 +366,15 @@ def test_respawned_locator_continues_with_transform_and_heading(
 
 def test_unknown_lever_arm_is_reported(ros: Ros, anchors: Path):
     locator = start(ros, anchors)
-    locator.wait_for_output("locating")
     live = LiveRobot(ros, seconds=2.0)
-    live.wait()
     live.play(2.0)
     text = "no transform from base_link to uwb_antenna on /tf_static"
-    ros.spin_until(lambda: text in live.values()[""])
+    ros.diagnosis("locator", lambda status: text in status.message)
     assert text in locator.output
 
 
 def test_lever_arm_of_zero_is_not_read_from_tf(ros: Ros, anchors: Path):
-    locator = start(ros, anchors, "lever_arm:=0,0,0")
-    locator.wait_for_output("locating")
+    start(ros, anchors, "lever_arm:=0,0,0")
     # Its other subscriptions were created later.
     ros.wait_for_subscribers("/uwb/range_corrected", 1)
     assert ros.node.count_subscribers("/tf_static") == 0
@@ -467,23 +426,6 @@ class Continuation:
         stamp = round(seconds * NANOSECONDS)
         estimate = Estimate(stamp, np.array([x, y, 0.0]), np.zeros(3), np.eye(6) * sd**2, heading)
         return self.motion.mixed(estimate, trusts_odometry=trusts)
-
-
-def test_pose_before_a_crash_is_moved_on_and_replaced_by_the_estimates():
-    robot = Continuation()
-    robot.drive(2.0, 2.0)
-    expected = 4.0 + math.cos(0.5), 2.0 + math.sin(0.5), 0.5
-    for yaw in (None, 0.7):
-        mixed = robot.mixed(5.0, 2.5, yaw, 0.3, 2.0)
-        assert (*mixed.position[:2], mixed.heading.yaw) == pytest.approx(expected)
-    for step in range(1, 400):
-        robot.drive(2.0 + 0.1 * step, 2.0 + 0.2 * step)
-        if step == 2:
-            assert 0.5 < robot.mixed(5.0, 2.5, 0.7, 0.3, 2.4).heading.yaw < 0.51, (
-                "the new heading is uncertain"
-            )
-    mixed = robot.mixed(39.0, 21.0, 0.6, 0.03, 81.8)
-    assert (*mixed.position[:2], mixed.heading.yaw) == pytest.approx((39.0, 21.0, 0.6), abs=0.03)
 
 
 def test_pose_before_a_short_gap_of_the_odometry_is_moved_on():
