@@ -213,29 +213,36 @@ def test_stop_during_a_pause_ends_the_thread_and_reports_no_end():
 
 
 def test_step_of_the_wall_clock_does_not_affect_a_replay(monkeypatch: pytest.MonkeyPatch):
-    wall_ns, step_ns = time.time_ns, [0]
+    step_ns = [0]
+    wall_ns = time.time_ns
     monkeypatch.setattr(time, "time_ns", lambda: wall_ns() + step_ns[0])
     pace = ReplayClock(Clock(clock_type=ClockType.SYSTEM_TIME))
     began_ns = pace.now_ns()
     stamps = []
-    for step, step_ns[0] in enumerate((0, -3600 * 10**9, 10_800 * 10**9)):
+    for step, step_s in enumerate((0, 0, -3600, 10_800)):
+        step_ns[0] = step_s * 10**9
         stamps.append(pace.stamp_ns(began_ns + step * MS))
     assert 0 < pace.now_ns() - began_ns < 60 * 10**9
-    assert [b - a for a, b in pairwise(stamps)] == [MS, MS]
+    assert stamps[1] - stamps[0] == MS
+    assert [round((b - a) / 1e9) for a, b in pairwise(stamps)] == [0, -3600, 14_400]
 
 
-def test_clocks_whose_comparison_was_interrupted_are_compared_again(monkeypatch: pytest.MonkeyPatch):
-    steady_ns, interruptions_ns = [0], [MS, MS, 0]
+def test_interruption_between_two_clock_readings_is_no_clock_step(monkeypatch: pytest.MonkeyPatch):
+    steady_ns, interrupted_ns = [0], [0]
 
     def wall_ns() -> int:
-        steady_ns[0] += interruptions_ns.pop(0)
+        steady_ns[0] += interrupted_ns[0]
         wall = 10**18 + steady_ns[0]
-        steady_ns[0] += MS * len(interruptions_ns)
+        steady_ns[0] += interrupted_ns[0]
         return wall
 
     monkeypatch.setattr(time, "monotonic_ns", lambda: steady_ns[0])
     monkeypatch.setattr(time, "time_ns", wall_ns)
-    assert ReplayClock(Clock(clock_type=ClockType.SYSTEM_TIME)).stamp_ns(0) == 10**18
+    pace = ReplayClock(Clock(clock_type=ClockType.SYSTEM_TIME))
+    stamps = []
+    for due_ns, interrupted_ns[0] in ((0, 0), (25 * MS, 5 * MS), (50 * MS, 0)):
+        stamps.append(pace.stamp_ns(due_ns))
+    assert [b - a for a, b in pairwise(stamps)] == [25 * MS, 25 * MS]
 
 
 def test_source_that_cannot_keep_its_rate_is_reported():

@@ -8,8 +8,8 @@ from rclpy.clock import Clock, ClockType
 
 from uwb_mitigation.nodes.support.lifecycle import clock_reader
 
-MAX_INTERRUPTION_NS = 1_000_000
-"""Maximum time between the readings of two clocks that are compared."""
+CLOCK_STEP_NS = 1_000_000
+"""If the node's clock shifts by more than this relative to the steady clock, it was set, and stamps follow it."""
 
 
 class ReplayClock:
@@ -28,19 +28,24 @@ class ReplayClock:
         return self._stamp_now_ns() if self._simulated else time.monotonic_ns()
 
     def stamp_ns(self, replay_ns: int) -> int:
-        """Convert a time of the replay clock to the node's clock; intervals are the same on both.
-
-        If the node's clock is set during the replay, the stamps stay on the old time.
-        """
+        """Convert a time of the replay clock to the node's clock; intervals are the same on both."""
         if self._simulated:
             return replay_ns
-        while self._offset_ns is None:
-            before_ns = time.monotonic_ns()
-            offset_ns = self._stamp_now_ns() - before_ns
-            # The process may be interrupted between the two readings.
-            if time.monotonic_ns() - before_ns <= MAX_INTERRUPTION_NS:
-                self._offset_ns = offset_ns
+        offset_ns, uncertainty_ns = self._read_both()
+        while self._offset_ns is None and uncertainty_ns > CLOCK_STEP_NS:
+            offset_ns, uncertainty_ns = self._read_both()
+        if self._offset_ns is None or abs(offset_ns - self._offset_ns) > CLOCK_STEP_NS + uncertainty_ns:
+            self._offset_ns = offset_ns
         return replay_ns + self._offset_ns
+
+    def _read_both(self) -> tuple[int, int]:
+        """Return the offset of the node's clock to the steady clock, and its uncertainty, ns.
+
+        The uncertainty distinguishes an interruption of the process between the two readings from a clock that was set.
+        """
+        before_ns = time.monotonic_ns()
+        offset_ns = self._stamp_now_ns() - before_ns
+        return offset_ns, time.monotonic_ns() - before_ns
 
     @property
     def _simulated(self) -> bool:
