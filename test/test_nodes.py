@@ -28,7 +28,7 @@ from uwb_mitigation.mitigation.model.bundle import Session, load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.nodes import mitigator as mitigator_node
 from uwb_mitigation.nodes.support.lifecycle import DUPLICATE_NAME_DELAY_S, ManagedNode
-from uwb_mitigation.nodes.support.parameter_tables import CRASHED, DAMAGED
+from uwb_mitigation.nodes.support.parameter_tables import CRASHED, DAMAGED, REFUSED
 from uwb_mitigation.recordings.decaranging import open_decaranging
 from uwb_mitigation.recordings.formats import open_recording
 from uwb_mitigation.simulation.simulated import SimulatedSource
@@ -87,19 +87,32 @@ def test_nodes_equal_the_library_on_a_real_log(ros: Ros, apartment: Path):
     assert {m.model_id for m in corrected} == {mitigation.bundle.model_id}
 
 
-@pytest.mark.parametrize("step", ["open", "__init__", "create_lifecycle_publisher"])
-def test_error_of_ros_at_the_start_is_a_crash_after_which_the_node_is_respawned(ros: Ros, step: str):
-    code = (
+@pytest.mark.parametrize(
+    ("step", "error", "code"),
+    [
+        ("driver.Driver.__init__", "RuntimeError", CRASHED),
+        ("driver.Driver.create_lifecycle_publisher", "RuntimeError", CRASHED),
+        ("publishing.prepare_encoders", "RuntimeError", CRASHED),
+        ("publishing.prepare_encoders", "TypeError", REFUSED),
+    ],
+)
+def test_only_an_error_of_ros_at_the_start_is_a_crash_and_no_empty_bag_remains(
+    ros: Ros, step: str, error: str, code: int, tmp_path: Path
+):
+    program = (
         "from uwb_mitigation.nodes import driver\n"
+        "from uwb_mitigation.nodes.feeds import publishing\n"
         "from uwb_mitigation.nodes.support import spinning\n"
         "def fail(*arguments, **options):\n"
-        "    raise RuntimeError('failed to create publisher')\n"
-        f"driver.Driver.{step} = fail\n"
+        f"    raise {error}('failed to create publisher')\n"
+        f"{step} = fail\n"
         "spinning.run_node('driver')\n"
     )
-    driver = ros.run([sys.executable, "-c", code])
-    assert driver.wait() == CRASHED
+    record = f"record:={tmp_path}/live.mcap"
+    driver = ros.run([sys.executable, "-c", program, "--ros-args", "-p", record])
+    assert driver.wait() == code
     assert "failed to create publisher" in driver.output
+    assert not list(tmp_path.glob("live*"))
 
 
 def test_damaged_bag_is_replayed_up_to_the_damage(ros: Ros, bag: Path, tmp_path: Path):

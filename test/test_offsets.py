@@ -75,6 +75,7 @@ def test_parameter_is_a_number_or_a_file(tmp_path: Path):
         ("default: yes", "default = True.*metres"),
         ("default: .nan", "default = nan"),
         ("default: 220", "default = 220 m: are these millimetres"),
+        ("default: -220", "default = -220 m: are these millimetres"),
         ("default: 1.0e+9", "-10 to 10 m"),
         ("default: '0.2'", "a number of metres"),
         ("offset: 0.2", "unknown key 'offset'.*default, anchors, tags, pairs"),

@@ -67,6 +67,9 @@ QOS = "-p qos_overrides./uwb/range_raw.subscription"
         ("driver -p source:=mcap -p path:=/nonexistent/bag.mcap", "/nonexistent/bag.mcap"),
         ("driver -p rate:=.nan", "rate"),
         ("driver -p source:=topic -p map:=string_json -p topic:=bad--x", "bad--x"),
+        (f"driver -r __node:={'a' * 300}", "node name length should not exceed"),
+        (f"driver -r __ns:=/{'a' * 300}", "invalid node namespace"),
+        (f"driver -r uwb/range_raw:={'a' * 300}", "topic length should not exceed"),
     ],
 )
 def test_node_refuses_a_parameter_at_its_start(ros: Ros, words: str, excerpt: str):
@@ -131,6 +134,7 @@ def test_file_after_a_crash_replaces_no_complete_or_partial_one(tmp_path: Path):
     for name in ("drive.mcap", "drive_2.mcap.part"):
         (tmp_path / name).touch()
     assert unused_path(tmp_path / "drive.mcap").name == "drive_3.mcap"
+    assert unused_path(Path("/dev/null")) == Path("/dev/null")
 
 
 def test_topics_can_be_remapped_and_the_frame_is_a_parameter(ros: Ros, tmp_path: Path):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-import signal
+import sys
 import threading
 import time
 from collections import Counter
@@ -16,7 +16,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from bag_material import write_records
-from port_events import wait_until
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
@@ -373,14 +372,33 @@ def test_respawned_driver_records_to_a_new_file_and_does_not_repeat_a_recording_
 ):
     (tmp_path / "respawn").mkdir()
     monkeypatch.setenv(RESPAWN_FOLDER, str(tmp_path / "respawn"))
-    options = ("wait_for_subscribers:=0", "start_delay:=0.0", f"record:={tmp_path / 'live.mcap'}")
-    crashed = ros.start("driver", *options)
-    wait_until(lambda: (tmp_path / "live.mcap.part").exists())
-    crashed.signal(signal.SIGKILL)
-    assert ros.start("driver", *options, "count:=40").wait() == 0
-    again = ros.start("driver", *options, "count:=40")
+    options = (
+        "wait_for_subscribers:=0",
+        "start_delay:=0.0",
+        f"record:={tmp_path / 'live.mcap'}",
+        "count:=40",
+    )
+    # The recording has ended, but its bag is not complete.
+    program = (
+        "import os\n"
+        "from uwb_mitigation.nodes.support.spinning import run_node\n"
+        "from uwb_mitigation.recordings.bag.writer import BagWriter\n"
+        "BagWriter._finish = lambda writer: os._exit(9)\n"
+        "run_node('driver')\n"
+    )
+    given = [word for option in options for word in ("-p", option)]
+    assert ros.run([sys.executable, "-c", program, "--ros-args", *given]).wait() == 9
+    respawned = ros.start("driver", *options)
+    assert respawned.wait() == 0
+    assert "record continues after a crash in" in respawned.output
+    again = ros.start("driver", *options)
     assert again.wait() == 0
+    assert "the recording has ended" in again.output
     assert "replaying" not in again.output
+    monkeypatch.delenv(RESPAWN_FOLDER)
+    new_launch = ros.start("driver", *options)
+    assert new_launch.wait() == 1
+    assert "an unfinished recording exists" in new_launch.output
     assert {file.name for file in tmp_path.glob("live*")} == {"live.mcap.part", "live_2.mcap"}
     with McapRecording(tmp_path / "live_2.mcap") as recording:
         assert len(list(recording)) == 40

@@ -45,11 +45,13 @@ class Driver(ManagedNode):
         self._ended = ended
         self._consumer = consumer
         self.exit_code = 0
+        self._has_finished = False
         self._make_feed: Callable[[], radios.SourceHandle] | None = None
         self._feed: radios.SourceHandle | None = None
         self._output: RangePublisher
         self._respawn_state = RespawnState(self.respawn_file("run"))
         if (code := self._respawn_state.exit_code) is not None:
+            self.get_logger().info("the recording has ended before this process was started: it ends, too")
             self._end_process(code)
             return
         refuse_errors(self, self._check)
@@ -73,6 +75,9 @@ class Driver(ManagedNode):
     def close(self) -> None:
         super().close()
         self._feed = self._make_feed = None
+        if self._has_finished:
+            # Not earlier: after a crash before the bag is complete, the recording is replayed again.
+            self._respawn_state.save_exit_code(self.exit_code)
 
     def describe(self) -> Description:
         return ("none", diagnostics.OK, "", {}) if self._feed is None else self._feed.describe()
@@ -121,7 +126,11 @@ class Driver(ManagedNode):
         """Return a parameter; a file that is written is a new one after a crash, so that the earlier one is kept."""
         value = self.value(name)
         if name in ("record", "capture") and value and self._respawn_state.is_respawned:
-            return str(unused_path(Path(value).expanduser()))
+            path = Path(value).expanduser()
+            new_path = unused_path(path)
+            if new_path != path:
+                self.get_logger().info(f"{name} continues after a crash in {new_path}")
+            return str(new_path)
         return value
 
     def _check(self, values: Mapping[str, Any]) -> None:
@@ -149,9 +158,8 @@ class Driver(ManagedNode):
         self.error = error
         if error is not None:
             self.get_logger().error(str(error))
-        code = 0 if error is None else DAMAGED
-        self._respawn_state.save_exit_code(code)
-        self._end_process(code)
+        self._has_finished = True
+        self._end_process(0 if error is None else DAMAGED)
 
     def _end_process(self, code: int) -> None:
         self.exit_code = code

@@ -90,8 +90,8 @@ class LineSettings(StreamSettings):
 def read_settings(value: ValueReader) -> list[LineSettings]:
     """Return the settings of the boards at `port`; raise ParameterError if a parameter is invalid."""
     addresses, mapping = [parse_address(port) for port in read_ports(value)], read_mapping(value)
-    line: dict[str, Any] = {"baud": read_baud(value, mapping.baud), "dtr": value("dtr")}
-    return [LineSettings(address, mapping, capture=read_capture(value), **line) for address in addresses]
+    line = {"baud": read_baud(value, mapping.baud), "dtr": value("dtr"), "capture": read_capture(value)}
+    return [LineSettings(address, mapping, **line) for address in addresses]
 
 
 def read_mapping(value: ValueReader) -> Mapping:

@@ -186,7 +186,8 @@ def read_ports(value: ValueReader) -> list[str]:
 
 def read_capture(value: ValueReader) -> Path | None:
     """Return the parameter `capture`; None = none."""
-    return Path(value("capture")).expanduser() if value("capture") else None
+    path = value("capture")
+    return Path(path).expanduser() if path else None
 
 
 def read_baud(value: ValueReader, default: int) -> int:

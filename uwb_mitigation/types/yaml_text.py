@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from numbers import Real
 from typing import Any
 
@@ -42,12 +41,13 @@ def check_id(value: object, what: str, where: str) -> int:
 
 def check_metres(value: object, name: str, where: str, low: float, high: float) -> float:
     """Return a number of metres; raise ParameterError for another value, or one out of its limits."""
-    if isinstance(value, bool) or not isinstance(value, Real):
+    if isinstance(value, bool) or not isinstance(value, int | Real):
         raise ParameterError(f"{name} = {value!r:.60}", where=where, valid="a number of metres")
-    metres = float(value)
-    if math.isfinite(metres) and low <= metres <= high:
-        return metres
-    hint = ": are these millimetres?" if high < abs(metres) <= 1000.0 * high else ""
+    # No float is as large as some whole numbers.
+    metres = value if isinstance(value, int) else float(value)
+    if low <= metres <= high:
+        return float(metres)
+    hint = ": are these millimetres?" if 1000.0 * low <= metres <= 1000.0 * high else ""
     raise ParameterError(f"{name} = {value!r:.60} m{hint}", where=where, valid=f"{low:g} to {high:g} m")
 
 

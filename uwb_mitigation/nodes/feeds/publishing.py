@@ -117,11 +117,16 @@ class RangePublisher:
 
     def _open_bag(self, path: Path) -> BagWriter:
         # Import here: other drivers need no writer of bags.
-        from uwb_mitigation.recordings.bag.writer import BagWriter
+        from uwb_mitigation.recordings.bag.writer import BagWriter, partial_file
 
         source = self._node.value("source")
         if os.path.lexists(path):
             raise ParameterError(f"parameter record = {path}: the file exists", valid="another path")
+        if (partial := partial_file(path)).exists():
+            raise ParameterError(
+                f"parameter record = {path}: an unfinished recording exists: {partial}",
+                valid="another path, or rename that file",
+            )
         origin = {"source": f"driver, source {source}"}
         if source == "simulated":
             origin["simulated"] = "true"
@@ -132,8 +137,10 @@ class RangePublisher:
         bag, self._bag = self._bag, None
         if bag is None:
             return
+        # A node that cannot start, and is respawned, leaves no empty bags.
+        error = None if bag.counts else self._node.error
         try:
-            bag.__exit__(None, None, None)
+            bag.__exit__(None if error is None else type(error), error, None)
         except RecordingError as error:
             self._node.get_logger().error(f"the recording is lost: {error}")
 

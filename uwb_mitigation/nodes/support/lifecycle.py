@@ -15,11 +15,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
-from rclpy.exceptions import (
-    InvalidParameterTypeException,
-    InvalidParameterValueException,
-    NameValidationException,
-)
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
@@ -27,10 +23,11 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
-from uwb_mitigation.errors import ParameterError, UwbMitigationError, check_name, missing_dependency
+from uwb_mitigation.errors import ParameterError, UwbMitigationError, check_name
 from uwb_mitigation.files import write_atomically
 from uwb_mitigation.nodes.support import diagnostics, endpoints
 from uwb_mitigation.nodes.support.parameter_tables import ALL_TABLES, RESPAWN_FOLDER, STANDARD, Parameter
+from uwb_mitigation.nodes.support.spinning import correctable_error
 from uwb_mitigation.types.ros import topics
 from uwb_mitigation.types.ros.topics import relative
 
@@ -73,7 +70,7 @@ class ManagedNode(LifecycleNode):
         self.given_parameters: dict[str, Any] = self._take_given_parameters()
         self._declare({row.name: row for row in ALL_TABLES[name]})
         self.error: UwbMitigationError | None = None
-        self._unexpected: Exception | None = None
+        self._transient: RuntimeError | None = None
         self._state = "unconfigured"
         self.now_ns = clock_reader(self.get_clock())
         self._last_unique_s = time.monotonic()
@@ -143,15 +140,14 @@ class ManagedNode(LifecycleNode):
 
         Raises:
             UwbMitigationError: configure failed.
-            Exception: configure failed with an error that the code does not expect: a bug, or an error of ROS that may
-                be transient.
+            RuntimeError: configure failed with an error of ROS, which may be transient.
         """
         if not self.value("autostart"):
             return
         if self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
             self.trigger_activate()
         elif self.error is not None:
-            raise self._unexpected or self.error
+            raise self._transient or self.error
 
     def value(self, name: str) -> Any:
         """Return the value of a parameter."""
@@ -204,17 +200,13 @@ class ManagedNode(LifecycleNode):
         self, state: str, step: Callable[[], None], on_failure: Callable[[], None] | None = None
     ) -> TransitionCallbackReturn:
         """Run a step; after success the node is in `state`."""
-        self._unexpected = None
+        self._transient = None
         try:
             step()
-        except UwbMitigationError as error:
-            self.error = error
-        except NameValidationException as error:
-            self.error = ParameterError(str(error), valid="the rules of ROS for names")
         except Exception as error:
-            self.error = missing_dependency(error) if isinstance(error, ImportError) else None
+            self.error = correctable_error(error)
             if self.error is None:
-                self._unexpected = error
+                self._transient = error if isinstance(error, RuntimeError) else None
                 self.get_logger().error(traceback.format_exc())
                 self.error = UwbMitigationError(
                     f"{type(error).__name__}: {error}", valid="this is a bug: see the log"

@@ -57,7 +57,12 @@ class RespawnState:
 
 
 def unused_path(path: Path) -> Path:
-    """Return the first of NAME, NAME_2, NAME_3 ... that does not exist and is not a partly written file."""
+    """Return the first of NAME, NAME_2, NAME_3 ... that does not exist and is not a partly written file.
+
+    A device or pipe is returned unchanged.
+    """
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        return path
     names = chain([path.name], (f"{path.stem}_{number}{path.suffix}" for number in count(2)))
     paths = map(path.with_name, names)
     return next(path for path in paths if not (os.path.lexists(path) or partial_path(path).exists()))

@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 
 import rclpy
 from rclpy.context import Context
+from rclpy.exceptions import NameValidationException
 from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -25,6 +26,9 @@ from uwb_mitigation.nodes.support.parameter_tables import CRASHED, REFUSED
 NodeT = TypeVar("NodeT", bound=Node)
 
 SPIN_S = 0.2
+
+NAME_ERRORS = ("invalid node name", "length should not exceed")
+"""Parts of rcl's errors for names and namespaces."""
 
 _stop = threading.Event()
 
@@ -123,6 +127,20 @@ def run_node(name: str) -> None:
     sys.exit(code)
 
 
+def correctable_error(error: Exception) -> UwbMitigationError | None:
+    """Return an error that a user can correct, also for a missing library and an invalid name; None for other errors."""
+    if isinstance(error, UwbMitigationError):
+        return error
+    if isinstance(error, ImportError):
+        return missing_dependency(error)
+    # rcl reports names that are too long only in its text.
+    text = str(error).partition(", at /")[0]
+    is_name = isinstance(error, RuntimeError) and any(words in text for words in NAME_ERRORS)
+    if is_name or isinstance(error, NameValidationException):
+        return ParameterError(text, valid="the rules of ROS for names")
+    return None
+
+
 def _run(name: str) -> int:
     """Initialise ROS, make the nodes, spin them, and destroy them in reverse order; return the exit code.
 
@@ -140,8 +158,8 @@ def _run(name: str) -> int:
         nodes.extend(make_nodes(stop))
         code_of_errors = CRASHED
         spin(nodes, stop)
-    except (ImportError, UwbMitigationError) as error:
-        problem = missing_dependency(error) if isinstance(error, ImportError) else error
+    except Exception as error:
+        problem = correctable_error(error)
         if problem is None:
             raise
         print(f"error: {problem}", file=sys.stderr)
