@@ -13,7 +13,8 @@ from command_line import run, succeed
 from drives import HALL, circuit, drive
 from rosbags.typesys import Stores, get_typestore
 
-from uwb_mitigation.calibration.held_out import HeldOut, select
+from uwb_mitigation.calibration import solution as solution_module
+from uwb_mitigation.calibration.held_out import MAX_INCREASE, HeldOut, select
 from uwb_mitigation.calibration.hypotheses import AnchorHypotheses
 from uwb_mitigation.calibration.site import calibrate_site
 from uwb_mitigation.calibration.site_data import read_site
@@ -252,7 +253,17 @@ def test_correction_is_selected_only_if_it_improves_each_drive():
     good, bad = errors((0.3, 0.2, 0.1)), errors((0.3, 0.2, 0.21), seed=2)
     halves = errors((0.3, 0.2, 0.1), is_separate=False)
     for parts, chosen in (([good], "c"), ([halves, bad], "b"), ([errors((0.3, 0.3, 0.3))], "a")):
-        assert select(parts, ["a", "b", "c"]) == chosen
+        assert select(parts, ["a", "b", "c"], "a") == chosen
+
+
+def test_correction_whose_live_position_is_not_clearly_better_than_the_baseline_is_not_selected():
+    """It would be refused, also if a simpler one helps."""
+    block = np.arange(400) // 40
+    residual_m = {name: np.full(400, value) for name, value in (("raw", 0.3), ("a", 0.2), ("b", 0.1))}
+    live_m = {"raw": np.ones(400), "a": np.full(400, 0.99), "b": np.where(block % 2, 0.9, 1.08)}
+    errors = HeldOut(block, residual_m, live_m, True)
+    assert errors.live_gain("b", "a").mean > -MAX_INCREASE
+    assert select([errors], ["a", "b"], "raw") == "a"
 
 
 def test_localisation_needs_few_ranges(site):
@@ -365,6 +376,16 @@ def test_calibration_is_refused_without_gain(located, name, factor, refusal):
     assert worse.refusal == f"on the drive of the check {refusal}"
 
 
+@pytest.mark.parametrize("level", ["one", "pair"])
+def test_standard_deviation_of_an_offset_contains_the_part_that_is_not_subtracted(located, level):
+    solution = replace(located[1].solution, common_share=0.5, offset_share=0.5)
+    published, offsets = solution.subtracted(level), solution.offsets(level)
+    for (tag, anchor), (value, sd) in solution.pairs.items():
+        remaining_m = value - offsets.lookup([tag], [anchor])[0]
+        assert published[tag, anchor][1] == pytest.approx(np.hypot(sd, remaining_m), abs=1e-6)
+    assert offsets.pair_sd == ({pair: sd for pair, (_, sd) in published.items()} if level == "pair" else {})
+
+
 @pytest.mark.parametrize(("wrong", "match"), [(range(1, 8), "check the unit"), ([1], "and anchor 1;")])
 def test_offsets_above_a_metre_are_refused(located, wrong, match):
     calibration = located[1]
@@ -467,6 +488,18 @@ def test_recording_with_cirs_uses_the_universal_network(tmp_path):
     ):
         assert after.range_m == pytest.approx(before.range_m - common_m, abs=1e-4)
         assert after.variance_m2 == before.variance_m2
+
+
+def test_reference_of_ranges_does_not_depend_on_what_is_subtracted(monkeypatch):
+    source = SimulatedSource.with_anchors(5, seed=4, count=400, rate_hz=20.0)
+    site = read_site([list(source)], source.anchors, UNIVERSAL)
+    mae_m = []
+    for share in (0.5, 1.0):
+        monkeypatch.setattr(solution_module, "SUBTRACTED_SHARE", share)
+        solution = solve_without_truth(site, height=Height(0.0), area=None)
+        mae_m.append(calibrate_site(site, UNIVERSAL, solution).mae_m)
+    for name in ("raw", "shipped model alone"):
+        assert mae_m[0][name] == pytest.approx(mae_m[1][name], abs=1e-6)
 
 
 def test_with_cirs_half_of_the_differences_of_true_offsets_is_subtracted():

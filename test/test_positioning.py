@@ -513,13 +513,14 @@ def test_constant_errors_move_a_position_as_least_squares_with_an_offset_does():
     assert redundancy == pytest.approx(1 / 4, abs=0.01), "four ranges, three unknowns"
 
 
-@pytest.mark.parametrize("is_corrected", [False, True])
-def test_published_covariance_contains_constant_errors_that_are_not_states(is_corrected: bool):
+@pytest.mark.parametrize("is_corrected", [[False], [True], [True, False, False, False]])
+def test_published_covariance_contains_constant_errors_that_are_not_states(is_corrected: list[bool]):
     one = RangeFilter(HALL, NoiseModel(offset_sd=0.0), 0.0, np.array([6.0, 4.0, 1.0]), np.eye(3) * 0.01)
-    one.update(0, math.dist(HALL.position[0], one.position), 0.01, is_corrected)
+    for row, corrected in enumerate(is_corrected):
+        one.update(row, math.dist(HALL.position[row], one.position), 0.01, corrected)
     AmbiguityCheck(EstimatorConfig(HALL, NoiseModel(offset_sd=0.0))).check(one, [0, 1, 2, 3], 2)
     gain, _ = constant_error_gain(HALL.position[:4], one.position, 2, 0.0)
-    np.testing.assert_allclose(one.unseen, (not is_corrected) * CONSTANT_SD**2 * gain, atol=1e-6)
+    np.testing.assert_allclose(one.unseen, (1.0 - np.mean(is_corrected)) * CONSTANT_SD**2 * gain, atol=1e-6)
 
 
 def test_small_errors_do_not_reduce_the_variance_of_the_common_offset():

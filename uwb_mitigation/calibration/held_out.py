@@ -125,20 +125,24 @@ def decisive(error_sets: Sequence[HeldOut]) -> list[HeldOut]:
     return [errors for errors in error_sets if errors.is_separate] or list(error_sets)
 
 
-def select(error_sets: Sequence[HeldOut], names: Sequence[str]) -> str:
+def select(error_sets: Sequence[HeldOut], names: Sequence[str], baseline: str) -> str:
     """Return the simplest correction that no more complex one improves.
 
     A more complex correction must improve significantly on each separate drive, and without any on the halves of the drive; the
     other parts must not become worse. With ground truth it must reduce the live position error, or the range error without
-    increasing the former: better ranges do not always give better positions.
+    increasing the former: better ranges do not always give better positions. Relative to the baseline, that error must clearly
+    decrease everywhere.
 
     Args:
         error_sets: errors of each drive, or of its halves.
         names: corrections in order of complexity.
+        baseline: what is used without a calibration.
     """
     decisive_sets = decisive(error_sets)
 
     def improves(errors: HeldOut, name: str, base: str) -> bool:
+        if errors.live_gain(name, baseline).low <= 0.0:
+            return False
         gain, live = errors.range_gain(name, base), errors.live_gain(name, base)
         if errors not in decisive_sets:
             return gain.mean > 0.0

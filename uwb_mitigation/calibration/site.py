@@ -348,7 +348,7 @@ def calibrate_site(
     )
     drives = (fold.evaluate(universal, corrections, is_separate=True) for fold in checks)
     held_out = [first_half.merged(second_half, is_first), *drives]
-    chosen = select(held_out, list(candidates))
+    chosen = select(held_out, list(candidates), baseline)
     level, kind = candidates[chosen]
     return SiteCalibration(
         site=site,
@@ -385,11 +385,11 @@ class _Fold:
             model = _fit(kind, training_site, solution, level)
             predicted_m = np.where(site.is_usable, model.correction_m(site), 0.0)
             range_m = site.ranges.range_m - predicted_m
-            # Without ground truth the reference of ranges without offsets contains no common offset, because the locator
-            # estimates it.
-            common_m = solution.common_m if level == NONE and solution.truth is None else 0.0
-            corrected_m = np.maximum(range_m - _offsets_m(site, solution.offsets(level)), 0.0)
-            residual_m[name] = self.reference.errors_of(corrected_m - common_m) + common_m
+            offsets = solution.offsets(level)
+            corrected_m = np.maximum(range_m - _offsets_m(site, offsets), 0.0)
+            # Without ground truth the track of the reference contains no common offset, because the locator estimates it.
+            remaining_m = solution.common_m - offsets.default if solution.truth is None else 0.0
+            residual_m[name] = self.reference.errors_of(corrected_m - remaining_m) + remaining_m
             if solution.truth is not None:
                 # The locator does not use the variance of ranges that no model corrected.
                 variance_m2 = np.full(len(range_m), np.nan)

@@ -72,8 +72,8 @@ class SiteSolution:
 
     Attributes:
         rows: int (n,), the ranges of the site that the model is fitted to. true_m: (n,), their true ranges.
-        pairs: offsets of the radios. common_m: the offset that is subtracted from all ranges, m.
-        offset_share: share of the differences of the offsets from the common one that is subtracted.
+        pairs: offsets of the radios. common_m: the offset that they have in common, m.
+        common_share, offset_share: shares of the common offset, and of the differences from it, that are subtracted.
         offsets_refused: why offsets of single anchors are not used; empty: they can be used.
         outliers: number of ranges that were excluded everywhere because their errors are implausible.
         notes: what was left out.
@@ -101,28 +101,34 @@ class SiteSolution:
     antenna_position: NDArray[np.float64]
     track: NDArray[np.float64]
     track_of: NDArray[np.intp]
+    common_share: float = 1.0
     offset_share: float = SUBTRACTED_SHARE
     offsets_refused: str = ""
 
     def subtracted(self, level: str) -> Pairs:
-        """Return what is subtracted from the ranges of each pair with the level `ONE` or `PAIR`, and its standard deviation, m."""
-        common_m = self.common_m
-        if level == ONE:
-            return {
-                pair: (common_m, math.hypot(sd, value - common_m)) for pair, (value, sd) in self.pairs.items()
-            }
-        return {
-            pair: (common_m + self.offset_share * (value - common_m), sd)
-            for pair, (value, sd) in self.pairs.items()
-        }
+        """Return what is subtracted from the ranges of each pair with the level `ONE` or `PAIR`, and its standard deviation, m.
+
+        The standard deviation contains the part of the estimate that is not subtracted, also of the common offset. It is only
+        reported: variances of corrected ranges do not depend on it.
+        """
+        common_m, share = self.common_share * self.common_m, self.offset_share if level == PAIR else 0.0
+        pairs = {}
+        for pair, (value, sd) in self.pairs.items():
+            subtracted_m = common_m + share * (value - self.common_m)
+            pairs[pair] = subtracted_m, math.hypot(sd, value - subtracted_m)
+        return pairs
 
     def offsets(self, level: str) -> Offsets:
         """Return the offset of each pair, with the level `ONE` the common offset for all, and with `NONE` none."""
-        if level != PAIR:
-            return Offsets(self.common_m if level == ONE else 0.0)
-        sds = {pair: sd for pair, (_, sd) in self.pairs.items() if math.isfinite(sd)}
-        values = {pair: value for pair, (value, _) in self.subtracted(PAIR).items()}
-        return Offsets(self.common_m, pairs=values, pair_sd=sds)
+        if level == NONE:
+            return Offsets()
+        common_m = self.common_share * self.common_m
+        if level == ONE:
+            return Offsets(common_m)
+        pairs = self.subtracted(PAIR)
+        values = {pair: value for pair, (value, _) in pairs.items()}
+        sds = {pair: sd for pair, (_, sd) in pairs.items() if math.isfinite(sd)}
+        return Offsets(common_m, pairs=values, pair_sd=sds)
 
 
 NONE, ONE, PAIR = "none", "one", "pair"
@@ -248,7 +254,8 @@ class _RangesOnly:
             rows=self._site_rows[labelled],
             true_m=distance_m[labelled],
             pairs=self._pairs,
-            common_m=common_m * (SUBTRACTED_SHARE if self._site.has_cirs else 1.0),
+            common_m=common_m,
+            common_share=SUBTRACTED_SHARE if self._site.has_cirs else 1.0,
             offsets_refused=self._offsets_refused(has_truth),
             outliers=outliers,
             notes=tuple(notes),

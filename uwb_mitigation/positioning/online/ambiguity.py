@@ -140,7 +140,7 @@ class AmbiguityCheck:
         gain, redundancy = constant_error_gain(anchors, position, dims, self._model.offset_sd)
         variance = state.persisting_variance(redundancy)
         excess = FEW_ANCHORS * max(variance - state.modelled_variance, 0.0)
-        constant = max(excess, state.constant_variance)
+        constant = max(excess, state.constant_variance(rows))
         filter_.unseen = self._widens * (constant * gain + state.hidden_offset_covariance())
         sd_m, scale = math.sqrt(max(FEW_ANCHORS * variance, RANGE_ERROR_M**2)), state.covariance_scale()
         self.error_sd_m = sd_m

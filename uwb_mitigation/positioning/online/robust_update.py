@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,6 +88,8 @@ class RobustUpdate:
         self.estimates_errors, self.consistency = False, 1.0
         self.residual_square, self._last_residual = 0.0, [0.0] * len(anchors)
         self._constant_rows: dict[int, int] = {}
+        # Whether the latest range of an anchor was raw.
+        self._is_raw: dict[int, bool] = {}
         self.H, self.x, self.P = np.zeros(n), np.zeros(n), np.zeros((n, n))
         self.x[: len(motion)] = motion
         self.P[self._offset, self._offset] = model.offset_sd**2
@@ -96,7 +99,8 @@ class RobustUpdate:
     def copy(self) -> RobustUpdate:
         """Return an independent copy."""
         twin = copy.copy(self)
-        for name in ("H", "P", "_constant_rows", "_error_variance", "_last_residual", "_noise_until", "x"):
+        lists = "_error_variance", "_last_residual", "_noise_until"
+        for name in ("H", "P", "x", "_constant_rows", "_is_raw", *lists):
             setattr(twin, name, getattr(self, name).copy())
         return twin
 
@@ -166,6 +170,7 @@ class RobustUpdate:
             The innovation divided by its standard deviation, and this standard deviation in m.
         """
         constant = self._constant_row(anchor) if is_corrected else 0
+        self._is_raw[anchor] = not is_corrected
         model, x, H, P, k = self._model, self.x, self.H, self.P, self._offset
         row = k + 1 + anchor
         variance, error_variance = model.variance(variance_m2), self._error_variance[anchor]
@@ -238,10 +243,10 @@ class RobustUpdate:
         """Mean variance of the persisting errors in the model, m^2."""
         return sum(self._error_variance) / len(self._error_variance)
 
-    @property
-    def constant_variance(self) -> float:
-        """Variance of constant errors that are not states, m^2."""
-        return 0.0 if self._constant_rows else CONSTANT_SD**2
+    def constant_variance(self, rows: Sequence[int]) -> float:
+        """Return the variance of constant errors that are not states, m^2: those of the received `rows` whose latest range was raw."""
+        is_raw = [self._is_raw[row] for row in rows if row in self._is_raw] or [True]
+        return CONSTANT_SD**2 * (sum(is_raw) / len(is_raw))
 
     def persisting_variance(self, redundancy: float) -> float:
         """Return the variance of the errors that do not average out, m^2, for the share of redundant ranges."""
