@@ -22,7 +22,7 @@ from drawn import Drawn, corrected_bag
 from drives import HALL, drive
 
 from uwb_mitigation.commands.offline.process import Job, process_bag
-from uwb_mitigation.errors import RecordingError, UwbMitigationError
+from uwb_mitigation.errors import ModelError, RecordingError, UwbMitigationError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
@@ -48,6 +48,7 @@ from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.headline import WHOLE, cards
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.playback import BagPlayer
+from uwb_mitigation.viewer.report import write_report
 from uwb_mitigation.viewer.scene import Scene
 from uwb_mitigation.viewer.server import ViewerServer
 from uwb_mitigation.viewer.state import View
@@ -315,6 +316,22 @@ def test_index_of_a_drive_has_tracks_errors_and_residuals(tmp_path: Path, monkey
     assert np.nanmax(np.abs(page.column("pairs", "residual"))) < 1.0, "of the minute before the position"
     again, _ = open_bag(bag, anchors, estimated=list(timeline.estimates.values()))
     assert again.timeline.estimates == timeline.estimates, "known tracks are not estimated again"
+
+
+def test_failed_correction_is_raised_and_shown(tmp_path: Path):
+    def fail(*_: object) -> None:
+        raise ModelError("broken", where="model.json")
+
+    path = write_bag(tmp_path / "raw.mcap")
+    with pytest.raises(ModelError, match=r"model\.json"):
+        BagPlayer(path, fail).index(None)
+    failing = SimpleNamespace(correct=fail, used={})
+    with pytest.raises(ModelError, match=r"model\.json"):
+        write_report(tmp_path / "report.html", path, EstimatorConfig(HALL), lambda: failing, [], {})
+    player = BagPlayer(path, lambda: failing)
+    player.index(None).join()
+    page = Drawn(View(player.scene, player=player))
+    assert "Reading stopped: ModelError: " in " ".join(page.controls.notice)
 
 
 @pytest.mark.parametrize("count", [1, 40])

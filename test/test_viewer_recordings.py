@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_material import START_NS, STEP_NS, corrected, record
+from bag_material import START_NS, STEP_NS, corrected, record, write_corrected
 from browser import Browser
 from drawn import Drawn, corrected_bag
 from drives import HALL, drive
@@ -21,7 +21,14 @@ from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.measurement import Status
 from uwb_mitigation.types.ros import codec
 from uwb_mitigation.types.ros.poses import encode_true_position
-from uwb_mitigation.types.ros.topics import ODOMETRY_TRUTH, ODOMETRY_TYPE
+from uwb_mitigation.types.ros.topics import (
+    ODOMETRY_TRUTH,
+    ODOMETRY_TYPE,
+    RANGE_CIR_TYPE,
+    RANGE_RAW,
+    RANGE_TRUTH,
+    RANGE_TRUTH_TYPE,
+)
 from uwb_mitigation.viewer import health
 from uwb_mitigation.viewer.histories import Sample
 from uwb_mitigation.viewer.palette import TrackKind
@@ -175,6 +182,29 @@ def test_index_reads_all_ranges(bag: Path, monkeypatch: pytest.MonkeyPatch):
     assert (whole.corrected, whole.ranges, whole.faults) == (999, 1000, 1)
     assert all(np.isfinite(history.columns.true_m).all() for history in whole.pairs.values())
     assert len(whole.pairs[1, 7].rows) == 200
+
+
+def test_truths_and_levels_may_follow_all_ranges_and_have_no_samples(tmp_path: Path):
+    count = 1200
+    items = [record(number) for number in range(count)]
+    with BagWriter(tmp_path / "late.mcap", {}) as out:
+        for number, item in enumerate(items):
+            write_corrected(out, item.measurement, corrected(number))
+        for item in items:
+            cir = replace(item.measurement.cir, samples=np.zeros(0, np.int16))
+            measurement = replace(item.measurement, cir=cir)
+            log_ns = START_NS + count * STEP_NS
+            out.write_message(RANGE_RAW, RANGE_CIR_TYPE, codec.encode_range(measurement), log_ns)
+            out.write_message(
+                RANGE_TRUTH, RANGE_TRUTH_TYPE, codec.encode_truth(measurement, item.truth), log_ns
+            )
+    whole = indexed(tmp_path / "late.mcap").whole
+    assert whole.errors == count
+    for (anchor, _), history in whole.pairs.items():
+        columns = history.columns
+        assert columns.true_m.tolist() == [4.0 + number for number in range(anchor - 1, count, 2)]
+        assert set(columns.gap_db) == {3.75}
+        assert set(columns.rx_dbm) == {-79.5}
 
 
 def test_residual_belongs_to_the_anchor_of_its_range():

@@ -68,11 +68,33 @@ def test_ranges_of_a_stopped_pair_age_and_disappear(view: View, clock: Clock) ->
     assert page.column("strip", "age").tolist() == [-50.0]
 
 
-def test_only_the_latest_pairs_are_kept() -> None:
-    scene = Scene()
+@pytest.mark.parametrize(("is_whole", "first"), [(False, 100), (True, 0)])
+def test_a_stream_keeps_the_latest_pairs_and_a_recording_all(is_whole: bool, first: int) -> None:
+    scene = Scene(is_whole=is_whole)
     for anchor in range(MAX_PAIRS + 100):
         scene.add_sample((anchor, 7), Sample(1000.0, 5.3, 5.1, 0.1, Status.OK))
-    assert {anchor for anchor, _ in scene.pairs} == set(range(100, MAX_PAIRS + 100))
+    assert {anchor for anchor, _ in scene.pairs} == set(range(first, MAX_PAIRS + 100))
+
+
+def test_ranges_with_equal_stamps_have_their_own_truths() -> None:
+    scene = Scene()
+    for sequence in range(20):
+        scene.add_sample((1, 7), Sample(1000.0, 5.0, 5.0, 0.1, Status.OK, sequence=sequence))
+        scene.set_truth((1, 7), 1000.0, sequence, 5.0 + sequence)
+    assert scene.errors == 20
+    assert scene.pairs[1, 7].columns.true_m.tolist() == [5.0 + sequence for sequence in range(20)]
+
+
+def test_pair_without_ranges_before_the_position_does_not_change_the_order() -> None:
+    whole = Scene(is_whole=True)
+    received_s = {2: 69.0, 3: 70.0, 1: 9.0}
+    for anchor, time_s in received_s.items():
+        whole.clock = lambda time_s=time_s: time_s
+        whole.add_sample((anchor, 7), Sample(1000.0 + time_s, 5.0, 5.0, 0.1, Status.OK))
+    scene = Scene()
+    scene.show(whole, 69.5)
+    assert list(scene.pairs) == [(1, 7), (2, 7)]
+    assert (scene.received_s, scene.latest_stamp_s(7)) == (69.0, 1069.0)
 
 
 def test_ranges_that_the_viewer_drops_change_neither_rate_nor_losses() -> None:

@@ -374,8 +374,9 @@ def test_late_positions_give_no_residuals():
 def test_history_of_the_selected_anchor_and_errors_with_standard_deviations():
     scene, _ = driven({1: 0.6})
     scene.pairs[1, 7].columns.gap_db[-1] = 9.0
-    for stamp_s in scene.pairs[1, 7].columns.stamp_s:
-        scene.set_truth((1, 7), stamp_s, 5.0)
+    columns = scene.pairs[1, 7].columns
+    for stamp_s, sequence in zip(columns.stamp_s, columns.sequence, strict=True):
+        scene.set_truth((1, 7), stamp_s, sequence, 5.0)
     column = shown(scene).column
     assert column("history", "residual") == pytest.approx(0.6)
     assert (column("history", "rate")[-1], column("history", "NLOS")[-1]) == pytest.approx((10.0, 100.0))

@@ -83,16 +83,16 @@ class SceneUpdater:
             self._adders[topic](tag, message)
 
     def measurement(self, measurement: RangeMeasurement) -> None:
-        trace = Trace.from_cir(measurement.cir)
-        if trace is not None:
-            levels = measurement.cir.power_gap_db, measurement.cir.rx_power_dbm
-            self._levels.add(measurement_key(measurement), levels)
+        levels = measurement.cir.power_gap_db, measurement.cir.rx_power_dbm
+        self._levels.add(measurement_key(measurement), levels)
+        if (trace := Trace.from_cir(measurement.cir)) is not None:
             self.scene.set_trace((measurement.anchor_id, measurement.tag_id), trace)
 
     def truth(self, key: MeasurementKey, truth: Truth) -> None:
         if key in self._without_truth:
             del self._without_truth[key]
-            self.scene.set_truth((key.anchor_id, key.tag_id), key.stamp_ns / NS_PER_S, truth.range_m)
+            pair = key.anchor_id, key.tag_id
+            self.scene.set_truth(pair, key.stamp_ns / NS_PER_S, key.sequence, truth.range_m)
         else:
             self._truths.add(key, truth)
 

@@ -40,7 +40,7 @@ R = TypeVar("R", bound="Rows")
 class BoundedDict(OrderedDict[K, V]):
     """A dictionary that keeps the latest `limit` entries that were added."""
 
-    def __init__(self, limit: int) -> None:
+    def __init__(self, limit: float) -> None:
         super().__init__()
         self._limit = limit
 

@@ -61,6 +61,7 @@ class BagPlayer:
         scene: what is shown; `index` sets its anchors.
         missing: messages for the page on data that the bag does not contain.
         models: number of ranges that `index` corrected, by choice of the model.
+        error: what has stopped the thread of `index`; the page shows it.
     """
 
     SPEEDS = 0.5, 1.0, 2.0, 5.0, 10.0, 50.0
@@ -73,6 +74,7 @@ class BagPlayer:
         self.position_s, self.speed, self.playing = 0.0, 1.0, False
         self.timeline = Timeline()
         self.models: Mapping[Choice, int] = {}
+        self.error: Exception | None = None
         self.missing = MissingData("No ranges up to this time.", "No anchor positions: set --anchors FILE.")
         if not recording.contents & RANGES:
             self.missing.ranges = "The recording contains tracks without ranges."
@@ -111,11 +113,14 @@ class BagPlayer:
             stamp_offset_s: added to the stamps of the ranges.
             check: returns `Timeline.displaced` for estimated tracks.
             estimated: tracks that are known already.
-        """
 
-        def run() -> None:
-            timeline, recording = self.timeline, self._recording
-            backend = self._new_backend() if self.corrects else None
+        Raises:
+            UwbMitigationError: the backend cannot be opened.
+        """
+        timeline, recording = self.timeline, self._recording
+        backend = self._new_backend() if self.corrects else None
+
+        def read() -> None:
             table = read_recording(recording, backend, timeline)
             self.models = {} if backend is None else backend.used
             if config is not None:
@@ -129,6 +134,14 @@ class BagPlayer:
                     limit = f"up to {MAX_CHECKED} ranges: run `track`."
                     timeline.notices.append(f"The positions of anchors are checked in recordings of {limit}")
             self._show()
+
+        def run() -> None:
+            try:
+                read()
+            except Exception as error:  # A player without a reader would wait for ever.
+                self.error = error
+                timeline.notices.append(f"Reading stopped: {type(error).__name__}: {error}")
+                timeline.is_read = timeline.is_complete = True
 
         if config is not None:
             with self.scene.lock:

@@ -24,7 +24,7 @@ from uwb_mitigation.positioning.online.robot_estimator import live_track
 from uwb_mitigation.positioning.recorded_tracks import TagTracks, check_one_tag, track_tag
 from uwb_mitigation.recordings.bag.pose_paths import read_truth
 from uwb_mitigation.recordings.bag.reader import BagReader, check_channel
-from uwb_mitigation.recordings.recorded_ranges import RangeTable
+from uwb_mitigation.recordings.recorded_ranges import KEY, RangeTable, Table, match
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.measurement import FAULTS
 from uwb_mitigation.types.ros import schemas, topics
@@ -51,6 +51,7 @@ BATCH = 64
 POSITIONS = frozenset({topics.POSE, topics.ODOMETRY, topics.POSE_SMOOTHED})
 RANGES = frozenset({topics.RANGE_RAW, topics.RANGE_CORRECTED})
 
+_TRUTH = np.dtype([*KEY, ("true_m", "f8")])
 _POSITION_TOPIC = re.compile(r"(.*)/uwb/(?:(tag_(?:\d+|0x[0-9a-f]+))/)?(pose|odometry|pose_smoothed)")
 
 
@@ -222,24 +223,49 @@ def read_recording(recording: Recording, backend: Corrector | None, timeline: Ti
         backend: corrects raw ranges; None: the recording contains corrected ranges.
         timeline: is filled; may be shown meanwhile.
     """
-    table, feed = RangeTable(), SceneUpdater(timeline.scene)
+    table, truths, feed = RangeTable(), Table(_TRUTH), SceneUpdater(timeline.scene)
     for log_ns, topic, message, tag in recording.corrected_events(backend):
         timeline.read_s = log_ns / NS_PER_S
         if topic == topics.RANGE_RAW:
             table.add_raw(message)
             timeline.cirs_ns.setdefault((message.anchor_id, message.tag_id), []).append(log_ns)
+        elif topic == topics.RANGE_TRUTH:
+            truths.add(*message[0], message[1].range_m)
         elif topic == topics.RANGE_CORRECTED:
             table.add_corrected(*message)
-        if topic != topics.ANCHORS:
+        if topic not in (topics.ANCHORS, topics.RANGE_RAW, topics.RANGE_TRUTH):
             feed.add(topic, message, tag)
     with timeline.scene.lock:
         if recording.damage:
             damage = NodeStatus(2, f"{recording.damage}: nothing beyond can be shown")
             timeline.scene.set_node_status("recording", damage)
+        _add_truths_and_levels(timeline.scene, table, truths.array())
         timeline.read_s, timeline.is_read = recording.seconds, True
         timeline.scene.incidents.check(recording.seconds)
         _add_largest_error(timeline.scene)
     return table
+
+
+def _add_truths_and_levels(scene: Scene, table: RangeTable, truths: NDArray[Any]) -> None:
+    """Set true ranges and levels, which a recording may contain in any order, and count the errors.
+
+    Args:
+        scene: with all corrected ranges.
+        table: the ranges.
+        truths: rows of `_TRUTH`.
+    """
+    ranges, measured = table.corrected.array(), table.raw.array()
+    true_m = np.append(truths["true_m"], np.nan)[match(ranges, truths)]
+    gap_db, rx_dbm = (
+        np.append(measured[name], np.nan)[match(ranges, measured)] for name in ("gap_db", "rx_dbm")
+    )
+    order, first = np.lexsort((ranges["tag"], ranges["anchor"])), 0
+    # By anchor and tag, as the ranges.
+    for _, history in sorted(scene.pairs.items()):
+        rows, columns = order[first : first + len(history.rows)], history.columns
+        first += len(rows)
+        columns.true_m[:], columns.gap_db[:], columns.rx_dbm[:] = true_m[rows], gap_db[rows], rx_dbm[rows]
+    scene.count_errors(np.stack([ranges["raw_m"], ranges["range_m"]]) - true_m)
 
 
 def estimate_tracks(

@@ -106,9 +106,9 @@ def write_report(
     """
     player = BagPlayer(bag, backend)
     player.index(config, stamp_offset_s, lambda *_: displaced, tracks).join()
+    if player.error is not None:
+        raise player.error
     player.seek(player.seconds)
-    while player.is_behind:
-        player.advance()
     figures, controls = draw_scene(View(player.scene, player=player))
     _, _, action, facts = controls.verdict
     lines = [f"{controls.headline}. {action}", facts, *controls.notice]

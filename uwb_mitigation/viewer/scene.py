@@ -155,7 +155,7 @@ class Scene:
         # Stamps of different tags may come from different clocks.
         self.latest_stamps: BoundedDict[int, tuple[float, float]] = BoundedDict(MAX_TAGS)
         self.ranges = self.corrected = self.faults = self.dropped = 0
-        self.pairs: BoundedDict[Pair, History] = BoundedDict(MAX_PAIRS)
+        self.pairs: BoundedDict[Pair, History] = BoundedDict(math.inf if self.is_whole else MAX_PAIRS)
         self.tags: BoundedDict[str, Pose] = BoundedDict(MAX_TAGS)
         # {tag: (filter of its raw ranges, stamp of the last pose whose height it got)}
         self._raw_locators: BoundedDict[int, tuple[TagEstimator, float]] = BoundedDict(MAX_TAGS)
@@ -228,28 +228,30 @@ class Scene:
         self.faults += sample.status.is_fault
         self.incidents.add_range(pair, self.clock(), stamp_s)
         self.received_s = self.clock()
-        residual_m, history = self._compare_with_position(pair, sample), self.pairs[pair]
-        history.add(sample, self.received_s, residual_m, None if self.is_whole else MAX_SAMPLES)
-        if not self.is_whole:
+        history = self.pairs[pair]
+        if self.is_whole:
+            history.add(sample, self.received_s, math.nan, None)
+        else:
+            history.add(sample, self.received_s, self._compare_with_position(pair, sample), MAX_SAMPLES)
             history.remove_before(tag_latest_s - HISTORY_S)
-        self._count_error(sample.raw_m, sample.range_m, sample.true_m)
+        if not math.isnan(sample.true_m):
+            self.count_errors(np.array([[sample.raw_m], [sample.range_m]]) - sample.true_m)
 
-    def _count_error(self, raw_m: float, corrected_m: float, true_m: float) -> None:
-        """Count a range in the histograms if its truth is known."""
-        errors_m = np.array([raw_m - true_m, corrected_m - true_m])
-        if not (np.abs(errors_m) <= MAX_RANGE_M).all():
-            return
-        self.error_counts += count_errors(errors_m[:, None])
-        self.error_sums_m += np.abs(errors_m)
-        self.errors += 1
+    def count_errors(self, errors_m: NDArray[np.float64]) -> None:
+        """Count raw and corrected errors, float64 (2, n), in the histograms; NaN: the truth is unknown."""
+        errors_m = errors_m[:, (np.abs(errors_m) <= MAX_RANGE_M).all(axis=0)]
+        self.error_counts += count_errors(errors_m)
+        self.error_sums_m += np.abs(errors_m).sum(axis=1)
+        self.errors += errors_m.shape[1]
 
-    def set_truth(self, pair: Pair, stamp_s: float, true_m: float) -> None:
-        """Set the truth of a range that was added without it."""
+    def set_truth(self, pair: Pair, stamp_s: float, sequence: int, true_m: float) -> None:
+        """Set the truth of a range of a stream that was added without it."""
         self.revision += 1
         columns = (self.pairs.get(pair) or History()).columns
-        for row in np.flatnonzero(columns.stamp_s == stamp_s):
+        is_known = (columns.stamp_s == stamp_s) & (columns.sequence == sequence)
+        for row in np.flatnonzero(is_known)[-1:]:
             columns.true_m[row] = true_m
-            self._count_error(columns.raw_m[row], columns.corrected_m[row], true_m)
+            self.count_errors(np.array([columns.raw_m[[row]], columns.corrected_m[[row]]]) - true_m)
 
     def set_trace(self, pair: Pair, trace: Trace) -> None:
         """Set the last CIR of a pair; those of a recording stay in the bag."""
@@ -302,12 +304,12 @@ class Scene:
         self.ranges, self.corrected, self.faults = whole.ranges, whole.corrected, whole.faults
         self.errors, self.error_counts = whole.errors, whole.error_counts
         self.error_sums_m = whole.error_sums_m
-        histories = {pair: history.until(now_s, now_s - HISTORY_S) for pair, history in whole.pairs.items()}
-        for pair, history in sorted(histories.items(), key=lambda item: item[1].received_s):
-            if (latest := history.latest) is not None:
-                self.pairs.add(pair, history)
-                self.latest_stamps.add(pair[1], (latest.stamp_s, history.received_s))
-                self.received_s = history.received_s
+        histories = [(pair, history.until(now_s, now_s - HISTORY_S)) for pair, history in whole.pairs.items()]
+        begun = [(pair, history) for pair, history in histories if len(history.rows)]
+        for pair, history in sorted(begun, key=lambda item: item[1].received_s):
+            self.pairs.add(pair, history)
+            self.latest_stamps.add(pair[1], (float(history.columns.stamp_s[-1]), history.received_s))
+            self.received_s = history.received_s
         for (name, kind), track in whole.tracks.items():
             rows = track.until(now_s).rows
             if len(rows):
@@ -324,8 +326,7 @@ class Scene:
         anchor, pose = self.anchors.get(pair[0]), self.tag_of(pair[1])
         if pose is None or anchor is None or self.age_s(pose) > NO_DATA_S:
             return math.nan
-        if not self.is_whole:
-            self._locate_raw(pair, pose, sample)
+        self._locate_raw(pair, pose, sample)
         # On a busy computer, positions arrive late.
         if abs(pose.stamp_s - sample.stamp_s) * pose.speed > MAX_MOVED_M:
             return math.nan
