@@ -151,7 +151,7 @@ class Scene:
 
     def clear(self) -> None:
         """Remove everything except the anchors."""
-        self.incidents = Incidents()
+        self.incidents = Incidents(None) if self.is_whole else Incidents()
         # Stamps of different tags may come from different clocks.
         self.latest_stamps: BoundedDict[int, tuple[float, float]] = BoundedDict(MAX_TAGS)
         self.ranges = self.corrected = self.faults = self.dropped = 0
@@ -303,7 +303,8 @@ class Scene:
         self.errors, self.error_counts = whole.errors, whole.error_counts
         self.error_sums_m = whole.error_sums_m
         histories = {pair: history.until(now_s, now_s - HISTORY_S) for pair, history in whole.pairs.items()}
-        for pair, history in sorted(histories.items(), key=lambda item: item[1].received_s):
+        # A pair without ranges until then has a time of NaN, which has no order.
+        for pair, history in sorted(histories.items(), key=lambda item: finite_or_zero(item[1].received_s)):
             if (latest := history.latest) is not None:
                 self.pairs.add(pair, history)
                 self.latest_stamps.add(pair[1], (latest.stamp_s, history.received_s))
@@ -416,11 +417,6 @@ def count_errors(errors_m: NDArray[np.float64]) -> NDArray[np.int64]:
     bins = len(ERROR_EDGES_M) - 1
     rows = np.clip(np.searchsorted(ERROR_EDGES_M, errors_m, side="right") - 1, 0, bins - 1)
     return np.stack([np.bincount(row, minlength=bins) for row in rows])
-
-
-def with_gaps(columns: NDArray[np.float64], gap_s: float) -> NDArray[np.float64]:
-    """Insert a row of NaN into float64 (n, k) wherever the first column, the time, increases by more than `gap_s`."""
-    return np.insert(columns, np.flatnonzero(np.diff(columns[:, 0]) > gap_s) + 1, np.nan, axis=0)
 
 
 def finite_or_zero(value: float) -> float:
