@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from bag_material import START_NS, STEP_NS, corrected, record, write_corrected
 from browser import Browser
-from drawn import Drawn, corrected_bag
+from drawn import Clock, Drawn, corrected_bag
 from drives import HALL, drive
 
 from uwb_mitigation.commands.offline.track import displaced_anchor
@@ -30,6 +30,8 @@ from uwb_mitigation.types.ros.topics import (
     RANGE_TRUTH_TYPE,
 )
 from uwb_mitigation.viewer import health
+from uwb_mitigation.viewer.figures import MAX_POINTS, thinned
+from uwb_mitigation.viewer.headline import Positions
 from uwb_mitigation.viewer.histories import Sample
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.playback import BagPlayer, Check
@@ -221,6 +223,33 @@ def test_residual_belongs_to_the_anchor_of_its_range():
     expected = {9: [6.5 - 4.0, math.nan], 5: [math.nan], 3: [6.5 - 6.0], 11: [math.nan]}
     for anchor, expected_m in expected.items():
         assert residuals_m[anchor] == pytest.approx(expected_m, nan_ok=True), "unknown anchor, old position"
+
+
+def test_last_range_before_a_position_is_shown_although_another_pair_begins_later():
+    clock = Clock()
+    whole, scene = Scene(clock, is_whole=True), Scene(clock)
+    for clock.now_s, anchor in ((9.0, 1), (50.0, 2), (60.0, 3), (99.0, 1)):
+        whole.add_sample((anchor, 7), Sample(clock.now_s, 5.0, 5.0, 0.1, Status.OK))
+    scene.show(whole, 50.0)
+    assert (scene.received_s, scene.latest_stamp_s(7)) == (50.0, 50.0)
+
+
+@pytest.mark.parametrize("first", [0, 3], ids=["in order", "overtaken"])
+def test_true_positions_that_overtake_each_other_are_compared_by_their_stamps(first: int):
+    scene = Scene(Clock(), is_whole=True)
+    for number in range(100):
+        scene.add_position("tag_7", TrackKind.CORRECTED, (number / 10, math.sin(number), 0.0, 0.0, 0.1))
+        number ^= first
+        scene.add_position("tag_7", TrackKind.TRUE, (number / 10, math.sin(number), 0.5, 0.0, 0.1))
+    assert Positions(View(scene), 7).errors(TrackKind.CORRECTED, -math.inf).rmse == pytest.approx(0.5)
+
+
+def test_thinned_line_is_interrupted_only_by_gaps():
+    time_s = np.arange(4.0 * MAX_POINTS)
+    time_s[1000:] += 60.0
+    line = thinned(np.column_stack([time_s, time_s]), 3.0)
+    assert len(line) == MAX_POINTS + 1
+    assert np.isnan(line[:, 1]).sum() == 1
 
 
 def test_radio_without_cirs_has_no_bad_ranges(tmp_path: Path):

@@ -1,6 +1,6 @@
 """Compare simulated with real ranges: levels and errors of the EVK1000 logs, and how errors change along a drive.
 
-Argument: the folder of the data sets (docs/background/contributing.md). The first table contains percentiles (5, 50, 95) of error in metres,
+`PYTHONPATH=. python docs/experiments/simulator_against_logs.py FOLDER`, with the folder of the data sets (docs/background/contributing.md). The first table contains percentiles (5, 50, 95) of error in metres,
 receive level, power gap, preamble count, threshold and peak, and the MAE before and after the subtraction of a linear bias model that is fitted to
 the real logs. The second one describes errors around their mean over a drive, limited to 0.5 m around their median: standard deviation in metres;
 share of white noise (half the variance of differences of successive ranges of an anchor); mean correlation of two anchors at the

@@ -25,10 +25,8 @@ CHUNK = 50_000
 """Number of rows that are collected before they are stored compactly."""
 
 KEY = [("stamp_ns", "i8"), ("tag", "u8"), ("anchor", "u8"), ("sequence", "u4")]
-_RAW = np.dtype([*KEY, ("log_ns", "i8"), ("range_m", "f8"), ("gap_db", "f8"), ("rx_dbm", "f8")])
-_CORRECTED = np.dtype(
-    [*KEY, ("log_ns", "i8"), ("status", "u1"), ("raw_m", "f8"), ("range_m", "f8"), ("variance_m2", "f8")]
-)
+_RAW = np.dtype([*KEY, ("range_m", "f8"), ("gap_db", "f8"), ("rx_dbm", "f8")])
+_CORRECTED = np.dtype([*KEY, ("status", "u1"), ("raw_m", "f8"), ("range_m", "f8"), ("variance_m2", "f8")])
 
 
 class Table:
@@ -102,7 +100,7 @@ class RangeTable:
     """Raw and corrected ranges of a recording.
 
     Attributes:
-        raw, corrected: their rows; `log_ns` is on the clock of the caller.
+        raw, corrected: their rows.
         skipped: number of messages that cannot be decoded, {reason: count}.
     """
 
@@ -110,15 +108,15 @@ class RangeTable:
     corrected: Table = field(default_factory=lambda: Table(_CORRECTED))
     skipped: Counter[str] = field(default_factory=Counter)
 
-    def add_raw(self, measured: RangeMeasurement, log_ns: int = 0) -> None:
-        """Append a measured range; `log_ns`: its time on the clock of the recorder."""
+    def add_raw(self, measured: RangeMeasurement) -> None:
+        """Append a measured range."""
         levels = measured.cir.power_gap_db, measured.cir.rx_power_dbm
-        self.raw.add(*measurement_key(measured), log_ns, measured.range_m, *levels)
+        self.raw.add(*measurement_key(measured), measured.range_m, *levels)
 
-    def add_corrected(self, key: MeasurementKey, corrected: CorrectedRange, log_ns: int = 0) -> None:
-        """Append the corrected range of a measurement; `log_ns`: its time on the clock of the recorder."""
+    def add_corrected(self, key: MeasurementKey, corrected: CorrectedRange) -> None:
+        """Append the corrected range of a measurement."""
         columns = corrected.status, corrected.range_raw_m, corrected.range_m, corrected.variance_m2
-        self.corrected.add(*key, log_ns, *columns)
+        self.corrected.add(*key, *columns)
 
     def by_tag(
         self, anchors: AnchorMap, stamp_offset_s: float, truths: Mapping[int | None, TruePath]

@@ -162,9 +162,10 @@ class DiffuseField:
     def moved(
         self, other: DiffuseField, progress: NDArray[np.float64], changes_at: NDArray[np.float64]
     ) -> DiffuseField:
-        """Return fields on the way to `other`, with the same distributions.
+        """Return fields on the way to `other`, with the same distributions; of the pattern loss, only mean and variance.
 
-        The rays of `other` replace those of this field one by one. All other properties change continuously.
+        The rays of `other` replace those of this field one by one. All other properties change continuously. On the way, up to
+        0.25 % of the pattern losses are negative (a gain).
 
         Args:
             other: fields at the end of the way.

@@ -121,7 +121,8 @@ class SimulatedSource(Simulated):
     """Tags on a robot's route through a flat, ranging to fixed anchors in turn; a `Source`.
 
     Every two metres of the route are a separate configuration for each pair, "simulated seed 1/tag 101/
-    anchor 3/segment 7". The diffuse field of each pair changes continuously, and the fading with each exchange.
+    anchor 3/segment 7". The diffuse field of each pair changes continuously, and the fading with each exchange:
+    neighbouring segments have correlated fields.
 
     Args:
         seed: 0 to 2^32 - 1.

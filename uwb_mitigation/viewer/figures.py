@@ -29,7 +29,6 @@ from uwb_mitigation.viewer.scene import (
     finite_or_zero,
     plain_tag_id,
     tag_label,
-    with_gaps,
 )
 from uwb_mitigation.viewer.state import PageState, drawable, new_source, set_rows
 
@@ -523,4 +522,6 @@ def status_marks() -> dict[str, Any]:
 
 def thinned(table: NDArray[np.float64], gap_s: float) -> NDArray[np.float64]:
     """Return rows of a line whose first column is the time: about `MAX_POINTS`, at equal steps, interrupted by gaps."""
-    return with_gaps(table[:: -max(1, -(-len(table) // MAX_POINTS))][::-1], gap_s)
+    rows = np.arange(len(table))[:: -max(1, -(-len(table) // MAX_POINTS))][::-1]
+    gaps = np.cumsum(np.diff(table[:, 0], prepend=table[:1, 0]) > gap_s)
+    return np.insert(table[rows], np.flatnonzero(np.diff(gaps[rows])) + 1, np.nan, axis=0)

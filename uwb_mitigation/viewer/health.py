@@ -207,7 +207,9 @@ def verdict(
     names = {anchor_id: place.name for anchor_id, place in scene.anchors.items()}
     common, texts = advice(anchors, names)
     # With a common cause, anchors that need attention are bad together.
-    bad = [key for key in anchors if states[key] == BAD or (common and states[key] == CHECK)]
+    wrong = (BAD, CHECK) if common else (BAD,)
+    # An anchor may be bad because of another tag only.
+    bad = [key for key in anchors if states[key] in wrong and (common or texts[key])]
     if not reason and bad:
         worst = max(bad, key=lambda key: [abs(anchors[key][n]) for n in ("stopped", "displaced", "residual")])
         reason, _, action = (common or texts[worst]).partition(": ")

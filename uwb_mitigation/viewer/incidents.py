@@ -34,12 +34,15 @@ class _Source:
 class Incidents:
     """Finds incidents in ranges and positions, which are added in the order of their times on one clock.
 
+    Args:
+        limit: number of the latest incidents that are kept; None: all, of a recording.
+
     Attributes:
-        found: (time, s; text) of the latest incidents.
+        found: (time, s; text) of the incidents.
     """
 
-    def __init__(self) -> None:
-        self.found: deque[tuple[float, str]] = deque(maxlen=MAX_EVENTS)
+    def __init__(self, limit: int | None = MAX_EVENTS) -> None:
+        self.found: deque[tuple[float, str]] = deque(maxlen=limit)
         # A tag comes before its anchors.
         self._sources: BoundedDict[tuple[int | None, int | str], _Source] = BoundedDict(MAX_SOURCES)
         self._check_s = -math.inf

@@ -40,7 +40,6 @@ from uwb_mitigation.viewer.scene import (
     DEFAULT_TAG,
     MAX_TAGS,
     POSITION,
-    NodeStatus,
     Scene,
     tag_label,
     tag_name,
@@ -188,7 +187,7 @@ class Timeline:
     Attributes:
         scene: its ranges, positions and incidents; times are log times from the beginning.
         read_s: time up to which it has been read. is_read: whether it has been read completely.
-        cirs_ns: {pair: log time of each raw range}.
+        cirs_ns: {pair: log time of each raw range with a CIR}.
         notices: messages for the page.
         estimates: {tag: its estimated tracks}, if the recording contains no positions.
         displaced: {anchor whose ranges fit another position: its median held-out residual, m}.
@@ -228,18 +227,27 @@ def read_recording(recording: Recording, backend: Corrector | None, timeline: Ti
         timeline.read_s = log_ns / NS_PER_S
         if topic == topics.RANGE_RAW:
             table.add_raw(message)
+<<<<<<< HEAD
             timeline.cirs_ns.setdefault((message.anchor_id, message.tag_id), []).append(log_ns)
         elif topic == topics.RANGE_TRUTH:
             truths.add(*message[0], message[1].range_m)
+=======
+            if len(message.cir.samples):
+                timeline.cirs_ns.setdefault((message.anchor_id, message.tag_id), []).append(log_ns)
+>>>>>>> r5-fix-page
         elif topic == topics.RANGE_CORRECTED:
             table.add_corrected(*message)
         if topic not in (topics.ANCHORS, topics.RANGE_RAW, topics.RANGE_TRUTH):
             feed.add(topic, message, tag)
     with timeline.scene.lock:
         if recording.damage:
+<<<<<<< HEAD
             damage = NodeStatus(2, f"{recording.damage}: nothing beyond can be shown")
             timeline.scene.set_node_status("recording", damage)
         _add_truths_and_levels(timeline.scene, table, truths.array())
+=======
+            timeline.notices.append(f"{recording.damage}: nothing beyond can be shown")
+>>>>>>> r5-fix-page
         timeline.read_s, timeline.is_read = recording.seconds, True
         timeline.scene.incidents.check(recording.seconds)
         _add_largest_error(timeline.scene)
@@ -332,7 +340,7 @@ def estimate_tracks(
 
 def _add_incidents(scene: Scene, label: str, track: NDArray[np.float64], seconds: float) -> None:
     """Add the incidents of an estimated track until the end of the recording."""
-    incidents = Incidents()
+    incidents = Incidents(None)
     for time_s, x, y in track[:, :3].tolist():
         incidents.add_position(label, time_s, x, y)
     incidents.check(seconds)

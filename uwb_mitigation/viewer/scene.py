@@ -151,7 +151,7 @@ class Scene:
 
     def clear(self) -> None:
         """Remove everything except the anchors."""
-        self.incidents = Incidents()
+        self.incidents = Incidents(None) if self.is_whole else Incidents()
         # Stamps of different tags may come from different clocks.
         self.latest_stamps: BoundedDict[int, tuple[float, float]] = BoundedDict(MAX_TAGS)
         self.ranges = self.corrected = self.faults = self.dropped = 0
@@ -417,11 +417,6 @@ def count_errors(errors_m: NDArray[np.float64]) -> NDArray[np.int64]:
     bins = len(ERROR_EDGES_M) - 1
     rows = np.clip(np.searchsorted(ERROR_EDGES_M, errors_m, side="right") - 1, 0, bins - 1)
     return np.stack([np.bincount(row, minlength=bins) for row in rows])
-
-
-def with_gaps(columns: NDArray[np.float64], gap_s: float) -> NDArray[np.float64]:
-    """Insert a row of NaN into float64 (n, k) wherever the first column, the time, increases by more than `gap_s`."""
-    return np.insert(columns, np.flatnonzero(np.diff(columns[:, 0]) > gap_s) + 1, np.nan, axis=0)
 
 
 def finite_or_zero(value: float) -> float:
