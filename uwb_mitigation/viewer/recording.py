@@ -227,27 +227,18 @@ def read_recording(recording: Recording, backend: Corrector | None, timeline: Ti
         timeline.read_s = log_ns / NS_PER_S
         if topic == topics.RANGE_RAW:
             table.add_raw(message)
-<<<<<<< HEAD
-            timeline.cirs_ns.setdefault((message.anchor_id, message.tag_id), []).append(log_ns)
-        elif topic == topics.RANGE_TRUTH:
-            truths.add(*message[0], message[1].range_m)
-=======
             if len(message.cir.samples):
                 timeline.cirs_ns.setdefault((message.anchor_id, message.tag_id), []).append(log_ns)
->>>>>>> r5-fix-page
+        elif topic == topics.RANGE_TRUTH:
+            truths.add(*message[0], message[1].range_m)
         elif topic == topics.RANGE_CORRECTED:
             table.add_corrected(*message)
         if topic not in (topics.ANCHORS, topics.RANGE_RAW, topics.RANGE_TRUTH):
             feed.add(topic, message, tag)
     with timeline.scene.lock:
         if recording.damage:
-<<<<<<< HEAD
-            damage = NodeStatus(2, f"{recording.damage}: nothing beyond can be shown")
-            timeline.scene.set_node_status("recording", damage)
-        _add_truths_and_levels(timeline.scene, table, truths.array())
-=======
             timeline.notices.append(f"{recording.damage}: nothing beyond can be shown")
->>>>>>> r5-fix-page
+        _add_truths_and_levels(timeline.scene, table, truths.array())
         timeline.read_s, timeline.is_read = recording.seconds, True
         timeline.scene.incidents.check(recording.seconds)
         _add_largest_error(timeline.scene)
