@@ -180,7 +180,7 @@ def test_gaps_are_shown_as_gaps(tmp_path: Path):
 
 def test_index_reads_all_ranges(bag: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(recorded_ranges, "CHUNK", 100)
-    whole = indexed(bag).whole
+    whole = indexed(bag).all_data
     assert (whole.corrected, whole.ranges, whole.faults) == (999, 1000, 1)
     assert all(np.isfinite(history.columns.true_m).all() for history in whole.pairs.values())
     assert len(whole.pairs[1, 7].rows) == 200
@@ -200,7 +200,7 @@ def test_truths_and_levels_may_follow_all_ranges_and_have_no_samples(tmp_path: P
             out.write_message(
                 RANGE_TRUTH, RANGE_TRUTH_TYPE, codec.encode_truth(measurement, item.truth), log_ns
             )
-    whole = indexed(tmp_path / "late.mcap").whole
+    whole = indexed(tmp_path / "late.mcap").all_data
     assert whole.errors == count
     for (anchor, _), history in whole.pairs.items():
         columns = history.columns

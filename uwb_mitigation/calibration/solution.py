@@ -111,10 +111,10 @@ class SiteSolution:
         The standard deviation contains the part of the estimate that is not subtracted, also of the common offset. It is only
         reported: variances of corrected ranges do not depend on it.
         """
-        common_m, share = self.common_share * self.common_m, self.offset_share if level == PAIR else 0.0
+        common_m, pair_share = self.common_share * self.common_m, self.offset_share if level == PAIR else 0.0
         pairs = {}
         for pair, (value, sd) in self.pairs.items():
-            subtracted_m = common_m + share * (value - self.common_m)
+            subtracted_m = common_m + pair_share * (value - self.common_m)
             pairs[pair] = subtracted_m, math.hypot(sd, value - subtracted_m)
         return pairs
 

@@ -160,34 +160,36 @@ class DiffuseField:
         return DiffuseField(*(getattr(self, field.name)[index] for field in fields(self)))
 
     def moved(
-        self, other: DiffuseField, progress: NDArray[np.float64], changes_at: NDArray[np.float64]
+        self, end: DiffuseField, progress: NDArray[np.float64], changes_at: NDArray[np.float64]
     ) -> DiffuseField:
-        """Return fields on the way to `other`, with the same distributions; of the pattern loss, only mean and variance.
+        """Return fields on the way to `end`, with the same distributions; of the pattern loss, only mean and variance.
 
-        The rays of `other` replace those of this field one by one. All other properties change continuously. On the way, up to
+        The rays of `end` replace those of this field one by one. All other properties change continuously. On the way, up to
         0.25 % of the pattern losses are negative (a gain).
 
         Args:
-            other: fields at the end of the way.
+            end: fields at the end of the way.
             progress: share of the way, 0 to 1, float64 (n,).
             changes_at: share of the way at which each ray is replaced, float64 (n, rays).
         """
         is_replaced = progress[:, None] > changes_at
-        near, far = np.maximum(1.0 - progress, 1e-9), np.maximum(progress, 1e-9)
+        remaining, passed = np.maximum(1.0 - progress, 1e-9), np.maximum(progress, 1e-9)
         # The first ray of the first cluster is at its start. The minimum of exponential variables is exponential.
-        first, other_first = self.delay_ns[:, :1], other.delay_ns[:, :1]
-        first_delay = np.minimum(first / near[:, None], other_first / far[:, None])
-        delay = first_delay + np.where(is_replaced, other.delay_ns - other_first, self.delay_ns - first)
-        power = np.where(is_replaced, other.mean_power, self.mean_power)
+        first, end_first = self.delay_ns[:, :1], end.delay_ns[:, :1]
+        first_delay = np.minimum(first / remaining[:, None], end_first / passed[:, None])
+        delay = first_delay + np.where(is_replaced, end.delay_ns - end_first, self.delay_ns - first)
+        power = np.where(is_replaced, end.mean_power, self.mean_power)
         mean_loss = math.prod(PATTERN_LOSS_DB)
         # The sum of squares of both weights is 1, so that variances stay the same.
-        near, far = np.sqrt(near), np.sqrt(far)
+        weight, end_weight = np.sqrt(remaining), np.sqrt(passed)
         return DiffuseField(
             delay,
             power / power.sum(axis=1, keepdims=True),
-            np.where(is_replaced, other.nakagami_m, self.nakagami_m),
-            near * self.shadowing_db + far * other.shadowing_db,
-            mean_loss + near * (self.pattern_loss_db - mean_loss) + far * (other.pattern_loss_db - mean_loss),
+            np.where(is_replaced, end.nakagami_m, self.nakagami_m),
+            weight * self.shadowing_db + end_weight * end.shadowing_db,
+            mean_loss
+            + weight * (self.pattern_loss_db - mean_loss)
+            + end_weight * (end.pattern_loss_db - mean_loss),
         )
 
     def fade(self, rng: np.random.Generator) -> NDArray[np.complex128]:

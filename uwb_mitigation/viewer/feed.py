@@ -102,8 +102,11 @@ class SceneUpdater:
             self._without_truth.add(key, None)
         sd_m = math.sqrt(corrected.variance_m2) if corrected.variance_m2 >= 0.0 else math.nan
         measured = corrected.range_raw_m, corrected.range_m, sd_m, corrected.status
-        known = math.nan if truth is None else truth.range_m, *self._levels.pop(key, (math.nan, math.nan))
-        sample = Sample(key.stamp_ns / NS_PER_S, *measured, *known, key.sequence)
+        truth_and_levels = (
+            math.nan if truth is None else truth.range_m,
+            *self._levels.pop(key, (math.nan, math.nan)),
+        )
+        sample = Sample(key.stamp_ns / NS_PER_S, *measured, *truth_and_levels, key.sequence)
         self.scene.add_sample((key.anchor_id, key.tag_id), sample)
 
     def _position(self, kind: TrackKind, tag: str, message: Any) -> None:

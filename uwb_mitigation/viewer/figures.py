@@ -174,7 +174,7 @@ class Quality(Chart):
         now_s = scene.clock() if page.view.player is None else 0.0
         # All of it moves every second.
         if page.changed("history", (page.selected, math.floor(now_s), page.view.complete is None)):
-            history = page.view.whole.pairs.get(page.selected or (-1, -1)) or page.history
+            history = page.view.all_data.pairs.get(page.selected or (-1, -1)) or page.history
             table = history.quality() - (now_s, 0.0, 0.0, 0.0)
             message = "" if np.isfinite(table[:, 1]).any() else "No residuals of this pair yet."
             self.fill(thinned(table, page.history.max_gap_s), message)
@@ -226,7 +226,7 @@ class LastCir(Chart):
         message = ""
         if trace is None:
             message = "No CIRs: the source sends none, or no raw ranges are received."
-            if any(other.trace for other in scene.pairs.values()) or (player and player.timeline.cirs_ns):
+            if any(history.trace for history in scene.pairs.values()) or (player and player.timeline.cirs_ns):
                 message = "No CIR of this pair yet."
         # Compare the trace instead of its stamp, because stamps may be equal.
         if not page.changed("cir", (page.selected, trace, message)):
@@ -457,7 +457,7 @@ class Map:
         """Fit the view of the map to its current content."""
         places = [anchor.position[:2] for anchor in scene.anchors.values()]
         places += [(pose.x, pose.y) for pose in scene.tags.values()]
-        for track in list(self._page.view.whole.tracks.values()):
+        for track in list(self._page.view.all_data.tracks.values()):
             places += np.percentile(track.rows[:, 1:3], (2, 98), axis=0).tolist() if len(track.rows) else []
         corners = np.array(places or [(0.0, 0.0), (10.0, 10.0)])
         low, high = corners.min(axis=0), corners.max(axis=0)

@@ -40,10 +40,10 @@ def _range_cards(scene: Scene, window: str) -> list[Card]:
     corrected, count, faults = scene.corrected, scene.ranges, scene.faults
     if not count:
         return []
-    share = f"{100.0 * corrected / count:.1f} %" if corrected else "none"
+    corrected_text = f"{100.0 * corrected / count:.1f} %" if corrected else "none"
     text = f"{corrected} of {count} ranges" + ("" if corrected or faults else ": no CIRs")
     text += f"; {faults} ranges not OK" if faults else ""
-    shown = [[f"Ranges corrected, {window}", share, text]]
+    shown = [[f"Ranges corrected, {window}", corrected_text, text]]
     if not corrected and not faults:
         shown.insert(0, [f"Correction, {window}", "none", "the radio sends no CIRs"])
     if scene.errors:
@@ -62,12 +62,12 @@ class Positions:
 
     def __init__(self, view: View, tag_id: int | None) -> None:
         is_ready = view.player is None or view.complete is not None
-        self._tracks = {key: track.rows for key, track in view.whole.tracks.items()} if is_ready else {}
+        self._tracks = {key: track.rows for key, track in view.all_data.tracks.items()} if is_ready else {}
         self._names = [name for name, kind in self._tracks if kind is TrackKind.CORRECTED]
         self._is_corrected = view.scene.corrected > 0
         self._name = next(iter(self._names), "")
         if tag_id is not None:
-            self._name = tag_name(tag_id, self._names, view.whole.pairs)
+            self._name = tag_name(tag_id, self._names, view.all_data.pairs)
         self._frame = tag_label(self._name or DEFAULT_TAG, tag_id).replace(" ", "_")
         self._estimated = view.complete.estimates.get(self._name) if view.complete else None
 
@@ -130,8 +130,10 @@ class Positions:
         }
         corrected, shown = self.errors(TrackKind.CORRECTED, begin_s), []
         for title, name in (("Position RMSE", "rmse"), ("95 % of position errors below", "p95")):
-            others = (f"{other}: {_metres(getattr(error, name))}" for other, error in errors.items())
-            shown.append([f"{title}, {window}", _metres(getattr(corrected, name)), "; ".join(others)])
+            filter_texts = (
+                f"{filter_name}: {_metres(getattr(error, name))}" for filter_name, error in errors.items()
+            )
+            shown.append([f"{title}, {window}", _metres(getattr(corrected, name)), "; ".join(filter_texts)])
         raw_m = errors[raw_name].rmse if raw_name in errors else math.nan
         # Without corrections, offsets make the difference.
         if self._is_corrected and corrected.rmse + raw_m > 0.0:

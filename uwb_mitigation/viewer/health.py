@@ -126,10 +126,12 @@ def advice(anchors: Mapping[int, Means], names: Mapping[int, str] = {}) -> tuple
     if common:
         return common, dict.fromkeys(anchors, "")
     labels = {anchor_id: f"Anchor {names.get(anchor_id) or format_id(anchor_id)}" for anchor_id in anchors}
-    found = {anchor_id: faults(means) for anchor_id, means in anchors.items()}
+    found_faults = {anchor_id: faults(means) for anchor_id, means in anchors.items()}
     wrong = [format_id(key) for key, means in anchors.items() if means["displaced"]]
-    other = f"Not judged: see anchor {wrong[0]}." if wrong else ""
-    return "", {key: f"{labels[key]} {texts[0][1]}" if texts else other for key, texts in found.items()}
+    not_judged = f"Not judged: see anchor {wrong[0]}." if wrong else ""
+    return "", {
+        key: f"{labels[key]} {texts[0][1]}" if texts else not_judged for key, texts in found_faults.items()
+    }
 
 
 def _common_advice(anchors: list[Means]) -> str:

@@ -76,8 +76,8 @@ class Incidents:
             self.found.append((time_s, f"{_name(key)}: back after {passed_s:.0f} s"))
             if key[0] is None:
                 # The tag was away, not its anchors.
-                for (_, tag), other in self._sources.items():
-                    other.time_s = time_s if tag == key[1] else other.time_s
+                for (_, tag), source_of_tag in self._sources.items():
+                    source_of_tag.time_s = time_s if tag == key[1] else source_of_tag.time_s
         else:
             mean_s = source.interval_s if math.isfinite(source.interval_s) else passed_s
             source.interval_s = mean_s + SMOOTHING * (passed_s - mean_s)

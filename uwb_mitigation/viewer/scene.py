@@ -298,27 +298,29 @@ class Scene:
         self.tracks.add((tag[:MAX_TEXT], kind), Rows(rows))
         self.revision += 1
 
-    def show(self, whole: Scene, now_s: float) -> None:
+    def show(self, recorded: Scene, now_s: float) -> None:
         """Show the minute before a time of a recording, and its tracks until then; counts are those of all its ranges."""
         self.clear()
-        self.ranges, self.corrected, self.faults = whole.ranges, whole.corrected, whole.faults
-        self.errors, self.error_counts = whole.errors, whole.error_counts
-        self.error_sums_m = whole.error_sums_m
-        histories = [(pair, history.until(now_s, now_s - HISTORY_S)) for pair, history in whole.pairs.items()]
+        self.ranges, self.corrected, self.faults = recorded.ranges, recorded.corrected, recorded.faults
+        self.errors, self.error_counts = recorded.errors, recorded.error_counts
+        self.error_sums_m = recorded.error_sums_m
+        histories = [
+            (pair, history.until(now_s, now_s - HISTORY_S)) for pair, history in recorded.pairs.items()
+        ]
         begun = [(pair, history) for pair, history in histories if len(history.rows)]
         for pair, history in sorted(begun, key=lambda item: item[1].received_s):
             self.pairs.add(pair, history)
             self.latest_stamps.add(pair[1], (float(history.columns.stamp_s[-1]), history.received_s))
             self.received_s = history.received_s
-        for (name, kind), track in whole.tracks.items():
+        for (name, kind), track in recorded.tracks.items():
             rows = track.until(now_s).rows
             if len(rows):
                 self.set_track(name, kind, rows)
             if len(rows) and kind is TrackKind.CORRECTED:
                 received_s, x, y, z, sd_m, stamp_s, *ellipse, heading_rad = rows[-1].tolist()
                 self.tags.add(name, Pose(x, y, z, tuple(ellipse), heading_rad, stamp_s, sd_m, received_s))
-        begin, end = (bisect_right(whole.reports, (at_s,)) for at_s in (now_s - HISTORY_S, now_s + 1e-6))
-        for _, name, report in whole.reports[begin:end]:
+        begin, end = (bisect_right(recorded.reports, (at_s,)) for at_s in (now_s - HISTORY_S, now_s + 1e-6))
+        for _, name, report in recorded.reports[begin:end]:
             self.set_node_status(name, report)
 
     def _compare_with_position(self, pair: Pair, sample: Sample) -> float:

@@ -53,7 +53,7 @@ class View:
         return self.timeline if self.timeline is not None and self.timeline.is_complete else None
 
     @property
-    def whole(self) -> Scene:
+    def all_data(self) -> Scene:
         """All data: of the recording as soon as it has been read, else those of the scene."""
         return self.scene if self.timeline is None else self.timeline.scene
 

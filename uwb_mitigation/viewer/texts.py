@@ -176,7 +176,7 @@ class Texts:
     def _incidents(self, scene: Scene) -> list[tuple[float | None, str]]:
         """Return the incidents: time in the recording, None if they are live; text."""
         if self._view.player is not None:
-            return [] if self._view.timeline is None else sorted(self._view.whole.incidents.found)
+            return [] if self._view.timeline is None else sorted(self._view.all_data.incidents.found)
         scene.incidents.check(now_s := scene.clock())
         latest = list(scene.incidents.found)[-MAX_SHOWN_EVENTS:]
         return [(None, f"{now_s - time_s:.0f} s ago: {text}") for time_s, text in latest]
