@@ -34,7 +34,7 @@ from uwb_mitigation_msgs.msg import RangeCir
 from uwb_mitigation.errors import DamagedRecordingError, UwbMitigationError
 from uwb_mitigation.nodes.feeds.replay import ReplayFeed
 from uwb_mitigation.nodes.feeds.replay_clock import ReplayClock
-from uwb_mitigation.nodes.support.parameter_tables import DRIVER, RESPAWN_FOLDER
+from uwb_mitigation.nodes.support.parameter_tables import DRIVER, RESPAWN_FOLDER, help_text
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.recordings.mcap import McapRecording
 from uwb_mitigation.simulation.simulated import SimulatedSource
@@ -399,6 +399,7 @@ def test_respawned_driver_records_to_a_new_file_and_does_not_repeat_a_recording_
     new_launch = ros.start("driver", *options)
     assert new_launch.wait() == 1
     assert "an unfinished recording exists" in new_launch.output
+    assert "an existing or unfinished file is refused" in help_text("driver")
     assert {file.name for file in tmp_path.glob("live*")} == {"live.mcap.part", "live_2.mcap"}
     with McapRecording(tmp_path / "live_2.mcap") as recording:
         assert len(list(recording)) == 40

@@ -180,7 +180,7 @@ DRIVER = (
     Parameter("capture", "", "File for the raw bytes of the boards, which `path` replays; an existing file is replaced, but after a crash "
               "the driver continues in NAME_2. Empty: none (uci, lines, pans)."),
     Parameter("record", "", "MCAP bag to which the raw ranges are written, completed when the node ends or is cleaned up; an "
-              "existing file is refused, but after a crash the driver continues in NAME_2. Empty: none."),
+              "existing or unfinished file is refused, but after a crash the driver continues in NAME_2. Empty: none."),
     Parameter("radio.reset", "", "Reset line of the chip, such as gpiochip0:25; empty: not connected (spi)."),
     Parameter("frame_id", "uwb_antenna", "Frame id of the receiving antenna, if the source contains none."),
     _SENSOR_RANGES,
