@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 import shutil
+import signal
 import sys
 from array import array
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from bag_material import write_records
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
-from diagnostic_msgs.msg import DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from rclpy.serialization import deserialize_message
 from ros_harness import PAUSED, Ros
@@ -27,7 +27,7 @@ from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import Session, load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.nodes import mitigator as mitigator_node
-from uwb_mitigation.nodes.support.lifecycle import DUPLICATE_NAME_DELAY_S, ManagedNode
+from uwb_mitigation.nodes.support.lifecycle import DUPLICATE_NAME_DELAY_S
 from uwb_mitigation.nodes.support.parameter_tables import CRASHED, DAMAGED, REFUSED
 from uwb_mitigation.recordings.decaranging import open_decaranging
 from uwb_mitigation.recordings.formats import open_recording
@@ -91,15 +91,16 @@ def test_nodes_equal_the_library_on_a_real_log(ros: Ros, apartment: Path):
     ("step", "error", "code"),
     [
         ("driver.Driver.__init__", "RuntimeError", CRASHED),
-        ("driver.Driver.create_lifecycle_publisher", "RuntimeError", CRASHED),
-        ("publishing.prepare_encoders", "RuntimeError", CRASHED),
-        ("publishing.prepare_encoders", "TypeError", REFUSED),
+        ("driver.Driver.create_lifecycle_publisher", "rcl.RCLError", CRASHED),
+        ("publishing.prepare_encoders", "OSError", CRASHED),
+        ("publishing.prepare_encoders", "RuntimeError", REFUSED),
     ],
 )
-def test_only_an_error_of_ros_at_the_start_is_a_crash_and_no_empty_bag_remains(
+def test_only_errors_of_ros_and_the_system_at_the_start_are_crashes_and_no_empty_bag_remains(
     ros: Ros, step: str, error: str, code: int, tmp_path: Path
 ):
     program = (
+        "from rclpy.impl.implementation_singleton import rclpy_implementation as rcl\n"
         "from uwb_mitigation.nodes import driver\n"
         "from uwb_mitigation.nodes.feeds import publishing\n"
         "from uwb_mitigation.nodes.support import spinning\n"
@@ -172,21 +173,29 @@ def test_ranges_that_cannot_be_corrected_pass_through(ros: Ros):
         assert math.isinf(answer.variance) == math.isnan(message.range)
 
 
-def test_duplicate_node_names_are_reported_except_for_a_killed_node():
-    names = [("mitigator", "/left")]
-    node = SimpleNamespace(
-        get_name=lambda: "mitigator",
-        get_namespace=lambda: "/left",
-        get_fully_qualified_name=lambda: "/left/mitigator",
-        get_node_names_and_namespaces=lambda: names,
-        _last_unique_s=0.0,
+def test_another_node_of_the_same_name_is_reported_but_not_one_that_may_have_been_killed(
+    ros: Ros, tmp_path: Path
+):
+    is_later = tmp_path / "later"
+    program = (
+        "import os, time, types\n"
+        "from uwb_mitigation.nodes.support import lifecycle, spinning\n"
+        f"clock = {{'monotonic': lambda: {DUPLICATE_NAME_DELAY_S} * os.path.exists('{is_later}')}}\n"
+        "lifecycle.time = types.SimpleNamespace(**vars(time) | clock)\n"
+        "spinning.run_node('mitigator')\n"
     )
-    assert ManagedNode._duplicate_name_warnings(node) == []
-    names *= 2
-    assert ManagedNode._duplicate_name_warnings(node) == [], "a killed node stays in the graph for a while"
-    node._last_unique_s -= DUPLICATE_NAME_DELAY_S
-    (warning,) = ManagedNode._duplicate_name_warnings(node)
-    assert "another node has the name /left/mitigator" in warning
+    name = ("-r", "__ns:=/left")
+    ros.run([sys.executable, "-c", program, "--ros-args", *name])
+    other = ros.start("mitigator", arguments=name)
+    ros.spin_until(lambda: ros.node.get_node_names_and_namespaces().count(("mitigator", "/left")) == 2)
+    arrays = ros.collect(DiagnosticArray, "/diagnostics")
+    ros.spin_until(lambda: len(arrays) >= 6)
+    warning = "another node has the name /left/mitigator"
+    assert not any(warning in status.message for array in arrays for status in array.status)
+    is_later.touch()
+    ros.diagnosis("left/mitigator", lambda status: warning in status.message)
+    assert other.signal(signal.SIGINT) == 0
+    ros.diagnosis("left/mitigator", lambda status: warning not in status.message)
 
 
 # Driver and mitigator in one process ------------------------------------------------------------------------------

@@ -16,6 +16,7 @@ from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.impl.implementation_singleton import rclpy_implementation as rcl
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
@@ -33,6 +34,9 @@ from uwb_mitigation.types.ros.topics import relative
 
 DUPLICATE_NAME_DELAY_S = 40.0
 """A second node of the same name is reported after this time: a killed node stays in the graph for up to 20 s."""
+
+_TRANSIENT = (OSError, rcl.RCLError, rcl.RMWError, rcl.RCUtilsError)
+"""Errors of the system and of ROS, which may have disappeared when a launch file respawns the node."""
 
 _DECLARED_BY_RCLPY = ("use_sim_time", "start_type_description_service")
 
@@ -70,7 +74,7 @@ class ManagedNode(LifecycleNode):
         self.given_parameters: dict[str, Any] = self._take_given_parameters()
         self._declare({row.name: row for row in ALL_TABLES[name]})
         self.error: UwbMitigationError | None = None
-        self._transient: RuntimeError | None = None
+        self._transient: Exception | None = None
         self._state = "unconfigured"
         self.now_ns = clock_reader(self.get_clock())
         self._last_unique_s = time.monotonic()
@@ -140,7 +144,7 @@ class ManagedNode(LifecycleNode):
 
         Raises:
             UwbMitigationError: configure failed.
-            RuntimeError: configure failed with an error of ROS, which may be transient.
+            OSError, RuntimeError: configure failed with an error of the system or of ROS, which may be transient.
         """
         if not self.value("autostart"):
             return
@@ -206,11 +210,10 @@ class ManagedNode(LifecycleNode):
         except Exception as error:
             self.error = correctable_error(error)
             if self.error is None:
-                self._transient = error if isinstance(error, RuntimeError) else None
+                self._transient = error if isinstance(error, _TRANSIENT) else None
                 self.get_logger().error(traceback.format_exc())
-                self.error = UwbMitigationError(
-                    f"{type(error).__name__}: {error}", valid="this is a bug: see the log"
-                )
+                remedy = "see the log" if self._transient else "this is a bug: see the log"
+                self.error = UwbMitigationError(f"{type(error).__name__}: {error}", valid=remedy)
         else:
             self.error, self._state = None, state
             return TransitionCallbackReturn.SUCCESS
