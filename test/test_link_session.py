@@ -10,7 +10,7 @@ import pytest
 from benchmarks.equipment.board import Board
 from uwb_mitigation.radios.settings import PortMessage, RadioSettings
 from uwb_mitigation.radios.wire import messages
-from uwb_mitigation.radios.wire.events import Connected, Disconnected, Event, LinkState, Loss
+from uwb_mitigation.radios.wire.events import Event, LinkState, Loss
 from uwb_mitigation.radios.wire.framing import FrameDecoder, FrameEncoder, WireFrame, encode_frame
 from uwb_mitigation.radios.wire.layout import Flag, LogLevel, MessageType, Mode
 from uwb_mitigation.radios.wire.messages import BoardStatus, Correction, Hello, Log
@@ -88,7 +88,7 @@ def test_messages_before_hello_are_counted_and_a_request_connects():
     assert bench.host_hears(b"boot: radio ok\r\n" + bench.board.measure(measurement(1), 0)) == []
     assert bench.session.counts["withheld"] == 1
     bench.run(20)
-    assert [type(event) for event in bench.events] == [Connected]
+    assert [type(event) for event in bench.events] == [Hello]
     assert (bench.session.hello.firmware_name, bench.session.hello.window) == ("simulated", 157)
 
 
@@ -177,7 +177,7 @@ def test_board_times_out_after_3_s_and_reconnects():
         bench.now += 10 * MS
         bench.events += bench.session.tick(bench.now, EPOCH + bench.now)
         bench.session.outgoing()
-    assert bench.received(Disconnected) == [Disconnected(Loss.TIMEOUT)]
+    assert bench.received(Loss) == [Loss.TIMEOUT]
     assert bench.session.idle_ns(bench.now) > 3000 * MS
 
     bench.board = sleeping
@@ -190,7 +190,7 @@ def test_status_once_a_second_keeps_a_board_without_measurements_connected():
     bench = connected()
     bench.run(20_000)
 
-    assert bench.received(Disconnected) == []
+    assert bench.received(Loss) == []
     assert len(bench.received(BoardStatus)) >= 19
 
 
@@ -200,7 +200,7 @@ def test_boot_id_reveals_a_reset_and_restarts_the_clock():
     bench.reboot()
     bench.host_hears(bench.board.hello(0))
 
-    assert bench.events[-2:] == [Disconnected(Loss.RESET), bench.received(Connected)[-1]]
+    assert bench.events[-2:] == [Loss.RESET, bench.received(Hello)[-1]]
     bench.run(1000)
     took_place = EPOCH + bench.now
     (event,) = bench.measure(1, late_ns=20 * MS)
@@ -214,7 +214,7 @@ def test_frame_numbers_reveal_a_reset_whose_hello_is_lost():
     bench.board.hello(0)
     for sequence in range(3):
         bench.measure(sequence)
-    assert bench.received(Disconnected) == [Disconnected(Loss.OUT_OF_SEQUENCE)]
+    assert bench.received(Loss) == [Loss.OUT_OF_SEQUENCE]
 
     bench.run(100)
 
@@ -294,7 +294,7 @@ def test_reopening_the_port_ends_the_connection_and_discards_a_partial_frame():
     data = bench.board.measure(measurement(1), bench.uptime_us)
     bench.host_hears(data[:100])
 
-    assert bench.session.opened(bench.now) == [Disconnected(Loss.CLOSED)]
+    assert bench.session.opened(bench.now) == [Loss.CLOSED]
     assert bench.session.radio is None
     assert bench.host_hears(data[100:]) == []
     assert bench.session.counts["withheld"] == 0

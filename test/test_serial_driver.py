@@ -28,7 +28,7 @@ from uwb_mitigation.radios import serial as serial_source
 from uwb_mitigation.radios.port import PortAddress
 from uwb_mitigation.radios.serial import BoardPort, SerialSettings
 from uwb_mitigation.radios.settings import PortMessage, RadioSettings, Role
-from uwb_mitigation.radios.wire.events import Disconnected, Loss
+from uwb_mitigation.radios.wire.events import Loss
 from uwb_mitigation.radios.wire.framing import FrameEncoder
 from uwb_mitigation.radios.wire.messages import Hello, RadioConfigured
 from uwb_mitigation.simulation.simulated import SimulatedSource
@@ -275,9 +275,9 @@ def test_board_of_another_protocol_version_is_a_problem_that_names_it():
 
 def test_loss_of_a_board_is_logged_unless_its_port_is_closed():
     port = BoardPort(SerialSettings(PortAddress("/dev/no")), (0, None, print, time.time_ns))
-    assert [type(event) for event in port._observed([Disconnected(Loss.RESET)])] == [
-        Disconnected,
+    assert [type(event) for event in port._observed([Loss.RESET])] == [
+        Loss,
         PortMessage,
     ]
     port.request_close()
-    assert [type(event) for event in port._observed([Disconnected(Loss.CLOSED)])] == [Disconnected]
+    assert [type(event) for event in port._observed([Loss.CLOSED])] == [Loss]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Iterable
+from functools import partial
 from numbers import Integral, Real
 
 
@@ -37,13 +38,8 @@ class UwbMitigationError(Exception):
 
     def __reduce__(self) -> tuple[object, ...]:
         # Keyword arguments do not survive the default pickling that process pools use.
-        return (_rebuild, (type(self), self.what, self.where, self.valid, self.suggestion))
-
-
-def _rebuild(
-    kind: type[UwbMitigationError], what: str, where: str, valid: str, suggestion: str
-) -> UwbMitigationError:
-    return kind(what, where=where, valid=valid, suggestion=suggestion)
+        place = {"where": self.where, "valid": self.valid, "suggestion": self.suggestion}
+        return partial(type(self), self.what, **place), ()
 
 
 class RecordingError(UwbMitigationError):

@@ -10,10 +10,11 @@ import contextlib
 import json
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import IO, Any, Protocol
+from typing import IO, Any
 
 from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError
 from uwb_mitigation.types.measurement import Record
@@ -90,27 +91,37 @@ class CaptureWriter:
                     self._file.close()
 
 
-class Session(Protocol):
+class Session(ABC):
     """The host's side of a board on a stream of bytes, at a port or in a capture. No I/O.
 
-    `now_ns` is monotonic, `stamp_ns` is the clock of the stamps.
+    `now_ns` is monotonic, `stamp_ns` is the clock of the stamps. Send `outgoing` right after each call.
     """
+
+    def __init__(self) -> None:
+        self._outgoing = bytearray()
 
     @property
     def delivers(self) -> bool:
         """Whether the ranges of the board are published."""
+        return True
 
+    @abstractmethod
     def opened(self, now_ns: int) -> Any:
-        """Start after the port was opened."""
+        """Start after the port was opened; discard partly received and unsent bytes."""
 
     def closed(self, now_ns: int) -> list[Any]:
         """End after the port was lost or closed; return events."""
+        return []
 
+    @abstractmethod
     def receive(self, data: bytes, now_ns: int, stamp_ns: int) -> list[Any]:
         """Handle received bytes and timeouts; return measurements and other events."""
 
     def outgoing(self) -> bytes:
         """Return the bytes to send, once."""
+        data = bytes(self._outgoing)
+        self._outgoing.clear()
+        return data
 
 
 class Capture(Source):

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from uwb_mitigation.errors import LinkError, ParameterError, RecordingError
-from uwb_mitigation.radios.capture import Capture
+from uwb_mitigation.radios.capture import Capture, Session
 from uwb_mitigation.radios.port import (
     ExchangeMonitor,
     PortAddress,
@@ -131,7 +131,7 @@ def open_capture(path: Path, value: ValueReader) -> Capture:
     return Capture(path, "lines", session)
 
 
-class LineSession:
+class LineSession(Session):
     """The host's side of a board that prints lines. No I/O.
 
     Call `receive` after each read, and at least every second; send `outgoing`. `now_ns` is monotonic, `stamp_ns` is the
@@ -152,8 +152,6 @@ class LineSession:
         ParameterError: the mapping is not for lines.
     """
 
-    delivers = True
-
     def __init__(self, mapping: Mapping, number: int = 0, *, has_datagrams: bool = False) -> None:
         if not (mapping.pattern or mapping.text):
             valid = "for lines: a mapping with pattern or text"
@@ -163,6 +161,7 @@ class LineSession:
             tag = tag.model_copy(update={"constant": tag.constant + number})
             fields = mapping.fields.model_copy(update={"tag": tag})
             mapping = mapping.model_copy(update={"fields": fields})
+        super().__init__()
         # Datagrams are only received.
         self._start = None if has_datagrams else mapping.start
         self.mapping, self._has_datagrams = mapping, has_datagrams
@@ -171,17 +170,14 @@ class LineSession:
         self.example, self.stamp_offset_s = "", 0.0
         self.opened(0)
 
-    def closed(self, now_ns: int) -> list[RangeMeasurement]:
-        """Do nothing: `opened` begins again."""
-        return []
-
     def opened(self, now_ns: int) -> None:
         """Begin with a port that was opened."""
         self.received = 0
         self._incomplete, self._incomplete_stamp_ns = b"", 0
         # The port may be opened in the middle of a line.
         self._is_partial = not self._has_datagrams
-        self._outgoing, self._answer = b"", b""
+        self._outgoing.clear()
+        self._answer = b""
         self._is_waking = self._was_started = self._was_reset = False
         self._pause_ns, self._due_ns, self._wakes = FIRST_PAUSE_NS, now_ns + FIRST_PAUSE_NS, 0
 
@@ -189,11 +185,6 @@ class LineSession:
     def unused(self) -> Counter[str]:
         """Numbers of rows that were not used, by reason."""
         return Counter({reason: count for reason, count in self.counts.items() if reason not in _LINE_COUNTS})
-
-    def outgoing(self) -> bytes:
-        """Return the bytes to send."""
-        data, self._outgoing = self._outgoing, b""
-        return data
 
     def receive(self, data: bytes, now_ns: int, stamp_ns: int) -> list[RangeMeasurement]:
         """Return the ranges of the lines that are complete; the stamp of a line is that of its first byte."""

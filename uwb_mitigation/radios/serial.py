@@ -36,9 +36,9 @@ from uwb_mitigation.radios.settings import (
     status_warning,
 )
 from uwb_mitigation.radios.wire import events
-from uwb_mitigation.radios.wire.events import Event, LinkState
+from uwb_mitigation.radios.wire.events import Event, LinkState, Loss
 from uwb_mitigation.radios.wire.layout import LogLevel, Mode
-from uwb_mitigation.radios.wire.messages import BoardStatus, Correction, Log, RadioConfigured
+from uwb_mitigation.radios.wire.messages import BoardStatus, Correction, Hello, Log, RadioConfigured
 from uwb_mitigation.radios.wire.session import BoardSession
 from uwb_mitigation.types.measurement import RangeMeasurement
 from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets, read_offsets
@@ -217,16 +217,16 @@ class BoardPort(StreamPort):
             case events.Refused(problem=problem, text=reason):
                 self._refused[problem] = reason
                 level, text = logging.ERROR, f"{problem}: {reason}"
-            case events.Connected(hello=hello):
+            case Hello():
                 self._refused.clear()
                 self._radio = self._radio_status = None
-                board, model = format_id(hello.board_id), f"{hello.model_id:08x} ({hello.model_id})"
-                text = f"connected to board {board}, model {model}, mode {hello.mode.name}"
-            case events.Disconnected(loss=loss):
+                board, model = format_id(event.board_id), f"{event.model_id:08x} ({event.model_id})"
+                text = f"connected to board {board}, model {model}, mode {event.mode.name}"
+            case Loss():
                 self.monitor.reset()
                 if not self.closed:
                     level = logging.WARNING
-                    text = f"disconnected from the board: {loss.value}; waiting for it"
+                    text = f"disconnected from the board: {event.value}; waiting for it"
             case Log(level=severity, text=board_text):
                 level = logging.WARNING if severity >= LogLevel.WARNING else logging.INFO
                 text = f"board: {board_text}"

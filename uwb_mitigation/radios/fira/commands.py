@@ -33,14 +33,14 @@ class CommandSequence:
 
     Args:
         on_end: called with the result of the steps and the time.
+        outgoing: the bytes to send are appended to it.
 
     Attributes:
-        outgoing: bytes to send.
         command: the command that waits for its answer; None = no steps are executed.
     """
 
-    def __init__(self, on_end: Callable[[str, int], None]) -> None:
-        self.outgoing = bytearray()
+    def __init__(self, on_end: Callable[[str, int], None], outgoing: bytearray) -> None:
+        self._outgoing = outgoing
         self.command: Command | None = None
         self._on_end = on_end
         self._steps: Steps | None = None
@@ -54,7 +54,7 @@ class CommandSequence:
     def cancel(self) -> None:
         """Forget the steps and the bytes to send."""
         self._steps = self.command = None
-        self.outgoing.clear()
+        self._outgoing.clear()
 
     def advance(self, answer: Packet | None, now_ns: int) -> None:
         """Continue after an answer, or without one."""
@@ -79,10 +79,10 @@ class CommandSequence:
 
     def queue(self, name: tuple[int, int], payload: bytes) -> None:
         """Send a command whose answer is not awaited."""
-        if len(self.outgoing) > MAX_OUTGOING_BYTES:
+        if len(self._outgoing) > MAX_OUTGOING_BYTES:
             # The port accepts no bytes.
-            self.outgoing.clear()
-        self.outgoing += encode_packets(*name, payload)
+            self._outgoing.clear()
+        self._outgoing += encode_packets(*name, payload)
 
     def _send(self, command: Command, now_ns: int) -> None:
         self._remaining -= 1

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 
+from uwb_mitigation.radios.capture import Session
 from uwb_mitigation.radios.fira import codes
 from uwb_mitigation.radios.fira.assembly import Assembly
 from uwb_mitigation.radios.fira.calibration import Calibration, OriginalsFile
@@ -45,7 +46,7 @@ _COUNTS = (
 )
 
 
-class UciSession:
+class UciSession(Session):
     """The host's side of one board.
 
     Call `receive` after each read, and at least every 50 ms; send `outgoing`. `now_ns` is monotonic, `stamp_ns` is
@@ -67,6 +68,7 @@ class UciSession:
     """
 
     def __init__(self, settings: UciSettings, originals: OriginalsFile | None = None) -> None:
+        super().__init__()
         settings.check()
         self.state = _NOT_CONNECTED
         self.window: tuple[int, int] | None = None
@@ -77,7 +79,7 @@ class UciSession:
         self.ranging = Ranging(settings)
         self.assembly = Assembly(self.ranging, self.counts)
         self._decoder = PacketDecoder()
-        self._commands = CommandSequence(self._finish)
+        self._commands = CommandSequence(self._finish, self._outgoing)
         self._calibration = Calibration(originals)
         self._identifies = originals is not None
         self._ready = self._stopping = self._state_requested = False
@@ -122,12 +124,6 @@ class UciSession:
     @property
     def _is_unanswered(self) -> bool:
         return self.state == _NO_ANSWER or self.state.startswith(_TEXT_ANSWER)
-
-    def outgoing(self) -> bytes:
-        """Return the bytes to send, once."""
-        data = bytes(self._commands.outgoing)
-        self._commands.outgoing.clear()
-        return data
 
     def totals(self) -> dict[str, int]:
         """Return all counts for diagnostics, {name: count}."""

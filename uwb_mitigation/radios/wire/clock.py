@@ -39,7 +39,12 @@ _MAX_HISTORY = 1024
 
 
 class DeviceClock:
-    """Strictly increasing map from a board's uptime in microseconds to the host's clock."""
+    """Strictly increasing map from a board's uptime in microseconds to the host's clock.
+
+    Attributes:
+        synchronised: a round trip has bounded the estimate from both sides.
+        drift: seconds that the host's clock gains per second of the board's clock.
+    """
 
     def __init__(self) -> None:
         self.reset()
@@ -50,23 +55,13 @@ class DeviceClock:
         self._origin: int | None = None
         self._updated_ns = 0
         self._offset = 0.0
-        self._drift = 0.0
+        self.drift = 0.0
         self._p_offset = 0.0
         self._p_cross = 0.0
         self._p_drift = _INITIAL_DRIFT_SD**2
-        self._is_bounded = False
+        self.synchronised = False
         self._times: list[int] = []
         self._stamps: list[int] = []
-
-    @property
-    def synchronised(self) -> bool:
-        """True once a round trip has bounded the estimate from both sides."""
-        return self._is_bounded
-
-    @property
-    def drift(self) -> float:
-        """Seconds that the host's clock gains per second of the board's clock."""
-        return self._drift
 
     @property
     def offset_ns(self) -> int:
@@ -93,7 +88,7 @@ class DeviceClock:
         if late_ns < 0:
             self._update(board_ns, high, _FLOOR_NS**2)
             self._clip(board_ns, float("-inf"), high)
-        elif not self._is_bounded:
+        elif not self.synchronised:
             # A late arrival has a small weight, so that a stall of seconds does not change the offset.
             self._update(board_ns, high, _LATE_ARRIVAL_NS**2 + late_ns**2)
 
@@ -115,7 +110,7 @@ class DeviceClock:
         low, high = float(earliest - self._origin), float(latest - self._origin)
         variance = (high - low) ** 2 / 12 + _FLOOR_NS**2
         self._update(board_ns, (low + high) / 2, variance)
-        self._is_bounded = True
+        self.synchronised = True
         self._clip(board_ns, low, high)
 
     def stamp(self, uptime_us: int, arrived_ns: int) -> int:
@@ -142,14 +137,14 @@ class DeviceClock:
 
     def _predict_ns(self, board_ns: int) -> int:
         origin = self._origin or 0
-        return board_ns + origin + round(self._offset + self._drift * (board_ns - self._updated_ns))
+        return board_ns + origin + round(self._offset + self.drift * (board_ns - self._updated_ns))
 
     def _update(self, board_ns: int, offset: float, variance: float) -> None:
         """Update the filter with a measured `offset` at board time `board_ns`."""
         dt_ns = board_ns - self._updated_ns
         if dt_ns > 0:
             dt_s = dt_ns / 1e9
-            self._offset += self._drift * dt_ns
+            self._offset += self.drift * dt_ns
             self._p_offset += dt_ns * (2 * self._p_cross + dt_ns * self._p_drift)
             self._p_offset += _OFFSET_WALK_NS2_PER_S * dt_s
             self._p_cross += dt_ns * self._p_drift
@@ -160,25 +155,25 @@ class DeviceClock:
         cross_offset = self._p_offset + dt_ns * self._p_cross
         cross_drift = self._p_cross + dt_ns * self._p_drift
         total = cross_offset + dt_ns * cross_drift + variance
-        innovation = offset - (self._offset + self._drift * dt_ns)
+        innovation = offset - (self._offset + self.drift * dt_ns)
         gain_offset, gain_drift = cross_offset / total, cross_drift / total
         self._offset += gain_offset * innovation
-        self._drift += gain_drift * innovation
+        self.drift += gain_drift * innovation
         self._p_offset -= gain_offset * cross_offset
         self._p_cross -= gain_offset * cross_drift
         self._p_drift -= gain_drift * cross_drift
 
     def _clip(self, board_ns: int, low: float, high: float) -> None:
         """Clip the estimate to its bounds; restart the filter if the correction is a clock step."""
-        predicted = self._offset + self._drift * (board_ns - self._updated_ns)
+        predicted = self._offset + self.drift * (board_ns - self._updated_ns)
         nearest = min(max(predicted, low), high)
         if nearest == predicted:
             return
         if abs(nearest - predicted) > _STEP_NS:
             origin = (self._origin or 0) + round(nearest)
-            enclosed = self._is_bounded
+            enclosed = self.synchronised
             self.reset()
-            self._origin, self._updated_ns, self._is_bounded = origin, board_ns, enclosed
+            self._origin, self._updated_ns, self.synchronised = origin, board_ns, enclosed
             self._p_offset = _LATE_ARRIVAL_NS**2
             return
         self._offset += nearest - predicted

@@ -6,8 +6,6 @@ import enum
 from collections import Counter
 from dataclasses import dataclass
 
-from uwb_mitigation.radios.wire.messages import Hello
-
 RADIO_PROBLEM = "the radio's settings are not used"
 OFFSETS_PROBLEM = "the offsets are not set, so the corrections of the board are not published"
 
@@ -21,26 +19,12 @@ class LinkState(enum.Enum):
 
 
 class Loss(enum.Enum):
-    """Why a connection ended."""
+    """Event: why a connection ended. No data is delivered until the next `Hello`."""
 
     TIMEOUT = "no intact frame was received for 3 s"
     RESET = "the board restarted"
     OUT_OF_SEQUENCE = "the sequence numbers of the board are out of order"
     CLOSED = "the port was closed"
-
-
-@dataclass(frozen=True, slots=True)
-class Connected:
-    """The board has sent its HELLO; measurements follow."""
-
-    hello: Hello
-
-
-@dataclass(frozen=True, slots=True)
-class Disconnected:
-    """The connection was lost. No data is delivered until the next `Connected`."""
-
-    loss: Loss
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +41,8 @@ class Refused:
 
 
 Event = object
-"""One of the classes above, a `RangeMeasurement`, a message of the board, or a `PortMessage`."""
+"""A `Hello` when a connection begins, a `Loss` when it ends, `Refused`, a `RangeMeasurement`, another message of the board, or a
+`PortMessage`."""
 
 COUNTS = Counter(
     # missing sequence numbers

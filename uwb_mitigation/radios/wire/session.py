@@ -10,6 +10,7 @@ import logging
 from typing import TypeVar
 
 from uwb_mitigation.errors import LinkError
+from uwb_mitigation.radios.capture import Session
 from uwb_mitigation.radios.settings import PortMessage, RadioSettings, RadioStatus
 from uwb_mitigation.radios.wire import events, messages
 from uwb_mitigation.radios.wire.clock import DeviceClock
@@ -83,7 +84,7 @@ class _Request:
         return True
 
 
-class BoardSession:
+class BoardSession(Session):
     """The host's side of the protocol with one board.
 
     There are two clocks: `now_ns` is monotonic and measures intervals; `stamp_ns` is the node's clock, used
@@ -103,9 +104,8 @@ class BoardSession:
         clock: estimate of the board's clock relative to the node's.
     """
 
-    delivers = True
-
     def __init__(self, *, mode: Mode | None = None, expected_model_id: int | None = None) -> None:
+        super().__init__()
         self.state = LinkState.CONNECTING
         self.hello: Hello | None = None
         self.radio: RadioConfigured | None = None
@@ -115,7 +115,6 @@ class BoardSession:
         self._decoder = FrameDecoder()
         self._encoder = FrameEncoder()
         self._expected_model_id = expected_model_id
-        self._outgoing = bytearray()
         self._mode = mode
         self._mode_request = _Request()
         unsupported = "its firmware does not support {}: flash a newer version, or {}"
@@ -181,12 +180,6 @@ class BoardSession:
         self._offsets_confirmed = False
         self._offsets_request.begin(SetOffsets(offsets))
         self._next_request_ns = 0
-
-    def outgoing(self) -> bytes:
-        """Return the bytes to send and clear the queue. Call it and send the bytes right after `receive` and `tick`."""
-        data = bytes(self._outgoing)
-        self._outgoing.clear()
-        return data
 
     def receive(self, data: bytes, now_ns: int, stamp_ns: int) -> list[Event]:
         """Return the events in the received bytes, in order. Never raises; invalid bytes are counted."""
@@ -287,7 +280,7 @@ class BoardSession:
             self._offsets_request.repeat(self._offsets_request.message)
             self._offsets_confirmed = False
             self._next_request_ns = now_ns
-            observed.append(events.Connected(hello))
+            observed.append(hello)
         elif frame.flags & Flag.ANSWER and self._mode_request.is_answered_by(hello.request_sequence):
             requested = hello.mode if self._mode is None else self._mode
             text = f"the board is in mode {requested.name}"
@@ -385,7 +378,7 @@ class BoardSession:
             request.sent.clear()
         self._sync_send_times_ns.clear()
         self._next_request_ns = now_ns
-        return [events.Disconnected(loss)] if was_ready else []
+        return [loss] if was_ready else []
 
     def _send_sync(self, now_ns: int, stamp_ns: int) -> None:
         request = self._send(MessageType.TIME_SYNC, b"")
