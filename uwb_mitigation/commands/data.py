@@ -44,15 +44,11 @@ def import_recordings(
     output: Annotated[Path | None, OUTPUT] = None,
     mapping: Annotated[
         str,
-        typer.Option(
-            "--map", metavar="FILE", help="Mapping file for other formats, or name of a shipped one."
-        ),
+        typer.Option("--map", metavar="FILE", help="Mapping file for other formats, or a shipped name."),
     ] = "",
     dry_run: Annotated[
         bool,
-        typer.Option(
-            "--dry-run", help="Show how the recording is understood, and write nothing (with --map)."
-        ),
+        typer.Option("--dry-run", help="With --map: show how the recording is understood; write nothing."),
     ] = False,
     cir: CirOption = "final",
     longest_pause: Annotated[

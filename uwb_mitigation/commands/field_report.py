@@ -40,9 +40,7 @@ def field_report(
     ],
     port: Annotated[
         str,
-        typer.Option(
-            metavar="P[,P2]", help="Port of the tag, and of the anchor if it is also on this computer."
-        ),
+        typer.Option(metavar="P[,P2]", help="Port of the tag, and of an anchor at this computer."),
     ],
     distance: Annotated[float, typer.Option(help="Distance between the antennas, m.")],
     output: Annotated[Path, output_option("FILE.zip", "File to attach to an issue.")] = Path(

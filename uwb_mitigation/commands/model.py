@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
 _DATA_HELP = "Recording with true ranges: a bag, or a folder of DecaRanging logs."
 OutputOption = Annotated[Path, output_option("FILE", "Bundle to write.")]
-# Options for one mode of `evaluate`; they are errors in the other mode.
-_CROSS_VALIDATION_OPTIONS = ("seeds", "folds", "scaling")
 
 
 def train(
@@ -88,9 +86,7 @@ def quantise(
     ],
     data: Annotated[
         Path,
-        typer.Option(
-            help="Recording with CIRs, with or without true ranges; best the training data of the bundle."
-        ),
+        typer.Option(help="Recording with CIRs, best the training data; true ranges are not needed."),
     ],
     output: OutputOption,
     force: Annotated[bool, typer.Option("--force", help="Replace FILE if it exists.")] = False,
@@ -128,8 +124,12 @@ def quantise(
     )
 
 
+def _cross_validation(description: str, default: str, **limits: Any) -> Any:
+    """Return an option of `evaluate --cross-validate`, which is an error without it."""
+    return typer.Option(help=f"With --cross-validate: {description}", show_default=default, **limits)
+
+
 def evaluate(
-    context: typer.Context,
     data: Annotated[Path, typer.Option(help=_DATA_HELP)],
     model: ModelOption = None,
     offsets: OffsetsOption = None,
@@ -141,33 +141,28 @@ def evaluate(
         ),
     ] = None,
     seeds: Annotated[
-        int,
-        typer.Option(
-            min=1,
-            max=100,
-            help="With --cross-validate: number of repetitions with other splits and networks.",
-        ),
-    ] = 3,
-    folds: Annotated[int, typer.Option(help="With --cross-validate: number of folds.")] = 6,
+        int | None,
+        _cross_validation("number of repetitions with other splits and networks.", "3", min=1, max=100),
+    ] = None,
+    folds: Annotated[int | None, _cross_validation("number of folds.", "6")] = None,
     scaling: Annotated[
-        ScalingName, typer.Option(help="With --cross-validate: max for data without preamble counts.")
-    ] = "preamble",
+        ScalingName | None, _cross_validation("max for data without preamble counts.", "preamble")
+    ] = None,
     json: JsonOption = None,
 ) -> None:
     """Compute the errors of raw and corrected ranges in a recording with ground truth."""
+    unused: dict[str, object] = {"--offsets": offsets, "--model": model}
+    mode, valid = "with", "one of them: cross-validation fits new models"
+    if cross_validate is None:
+        unused = {"--seeds": seeds, "--folds": folds, "--scaling": scaling}
+        mode, valid = "without", "only with --cross-validate"
+    if given := ", ".join(flag for flag, value in unused.items() if value is not None):
+        raise ParameterError(f"{given} {mode} --cross-validate", valid=valid)
     if cross_validate is not None:
-        if offsets is not None:
-            raise ParameterError("--offsets with --cross-validate", valid="without --cross-validate")
-        if model is not None:
-            raise ParameterError(
-                "--model with --cross-validate", valid="one of them: cross-validation fits new models"
-            )
         from uwb_mitigation.mitigation.preprocessing import Scaling
 
-        _compare(data, folds, seeds, Scaling(scaling), json)
+        _compare(data, 6 if folds is None else folds, seeds or 3, Scaling(scaling or "preamble"), json)
         return
-    if unused := _options_given(context, _CROSS_VALIDATION_OPTIONS):
-        raise ParameterError(f"{unused} without --cross-validate", valid="only with --cross-validate")
     from uwb_mitigation.mitigation.correction import Mitigation
     from uwb_mitigation.mitigation.model.shipped import load_model
     from uwb_mitigation.recordings.formats import open_recording
@@ -209,10 +204,3 @@ def _dataset(data: Path, preprocessing: Preprocessing, truth: Sequence[Path] = (
         name, dataset = recordings.load_dataset(data, preprocessing, truth, on_record)
     console.show_skipped(dataset.skipped)
     return name, dataset
-
-
-def _options_given(context: typer.Context, names: Sequence[str]) -> str:
-    """Return the options of these parameters that the command line contains, separated by commas."""
-    parameters = [parameter for parameter in context.command.params if parameter.name in names]
-    sources = {option.opts[0]: context.get_parameter_source(option.name or "") for option in parameters}
-    return ", ".join(flag for flag, source in sources.items() if source and source.name == "COMMANDLINE")

@@ -13,7 +13,7 @@ import typer
 from uwb_mitigation.commands.support import console
 from uwb_mitigation.commands.support.bundles import ModelOption, bundle_for
 from uwb_mitigation.commands.support.checks import check_output, output_option
-from uwb_mitigation.commands.support.console import JsonOption
+from uwb_mitigation.commands.support.console import JsonOption, print_line, show_table, warn
 from uwb_mitigation.errors import ParameterError, parse_id
 
 if TYPE_CHECKING:
@@ -26,8 +26,7 @@ def offset(
     bag: Annotated[
         Path,
         typer.Argument(
-            metavar="BAG",
-            help="Recording of ranges in line of sight: a bag, or a folder of DecaRanging logs.",
+            metavar="BAG", help="Ranges in line of sight: a bag, or a folder of DecaRanging logs."
         ),
     ],
     distance: Annotated[
@@ -41,15 +40,11 @@ def offset(
     model: ModelOption = None,
     output: Annotated[
         Path | None,
-        output_option(
-            "FILE", "File of offsets to write, for --offsets and the parameter `offsets` of the nodes."
-        ),
+        output_option("FILE", "File to write, for --offsets and the parameter `offsets` of the nodes."),
     ] = None,
     common: Annotated[
         bool,
-        typer.Option(
-            "--common", help="Write one common offset, if the same boards were at several positions."
-        ),
+        typer.Option("--common", help="Write one offset, if the same boards were at several positions."),
     ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace files that exist.")] = False,
     json: JsonOption = None,
@@ -108,8 +103,6 @@ def _id(name: str, text: str) -> int:
 
 
 def _show(estimate: OffsetEstimate) -> None:
-    from uwb_mitigation.commands.support.console import print_line, show_table, warn
-
     accepted = [
         {**asdict(placement), "placement": PurePath(placement.placement).name}
         for placement in estimate.placements

@@ -171,8 +171,7 @@ def survey(
         check_name("anchor of --fixed:", text.lower(), ids, valid=valid)
     rows = [ids[text.lower()] for text in fixed or []]
     tag = max(recorded.tags, key=lambda recording: len(recording.ranges))
-    with console.progress() as bar:
-        bar.add_task(f"surveying from {len(tag.ranges)} ranges of tag {format_id(tag.tag_id)}", total=None)
+    with console.step_bar(f"surveying from {len(tag.ranges)} ranges of tag {format_id(tag.tag_id)}"):
         result = survey_anchors(config, tag.ranges, off_m=off, fixed=frozenset(rows))
     save_anchors(
         output, result.anchors, f"surveyed from {bag.name}, tag {format_id(tag.tag_id)}", force=force
@@ -192,8 +191,7 @@ def _read(
     from uwb_mitigation.recordings.recorded_ranges import read_ranges
 
     config = read_config(bag, read_anchors(bag, anchors), settings, warn)
-    with console.progress() as bar:
-        bar.add_task("reading", total=None)
+    with console.step_bar("reading"):
         corrected = () if mitigation is None else mitigation.correct_records(open_recording(bag))
         recorded = read_ranges(bag, config.anchors, settings.stamp_offset_s, corrected)
     for text in recorded.warnings:

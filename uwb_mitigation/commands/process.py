@@ -36,9 +36,7 @@ def process(
     offsets: OffsetsOption = None,
     workers: Annotated[
         int | None,
-        typer.Option(
-            "-j", "--jobs", help="Bags that are processed at the same time. Default: number of cores."
-        ),
+        typer.Option("-j", "--jobs", help="Bags processed at the same time. Default: number of cores."),
     ] = None,
     scheduler: Annotated[
         str | None,

@@ -34,9 +34,7 @@ def train_universal(
     ] = None,
     workers: Annotated[
         int | None,
-        typer.Option(
-            min=1, max=256, help="Number of processes for the simulation; default: one per processor."
-        ),
+        typer.Option(min=1, max=256, help="Processes of the simulation; default: one per processor."),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace files that exist.")] = False,
     json: JsonOption = None,

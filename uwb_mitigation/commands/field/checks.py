@@ -94,15 +94,14 @@ class Observation:
 
 def run_checks(o: Observation) -> list[Check]:
     """Return all checks that apply to an observation."""
-    verdict, remedy = Verdict.PASS, ""
-    if o.problem:
-        verdict, remedy = Verdict.FAIL, "see the troubleshooting of the board"
-    rate_hz = len(o.ranges) / o.seconds
+    rate_hz, remedy = len(o.ranges) / o.seconds, "see the troubleshooting of the board"
+    problem = Verdict.FAIL if o.problem else Verdict.PASS
+    warning = Verdict.WARNING if o.warnings else Verdict.PASS
     checks = [
-        Check("problem of the driver", o.problem or "none", "none", verdict, remedy),
-        _warnings(o),
+        _check("problem of the driver", o.problem or "none", "none", problem, remedy),
+        _check("warnings of the driver", "; ".join(o.warnings[:5]) or "none", "none", warning, remedy),
         *_settings(o.written, o.read),
-        _judge("ranges per second", rate_hz, 5, 1, "Hz", "see the troubleshooting of the board", low=True),
+        _judge("ranges per second", rate_hz, 5, 1, "Hz", remedy, low=True),
         _ids(o),
         *_failures(o),
     ]
@@ -123,21 +122,17 @@ def run_checks(o: Observation) -> list[Check]:
     return checks
 
 
-def _warnings(o: Observation) -> Check:
-    name, remedy = "warnings of the driver", "see the troubleshooting of the board"
-    if not o.warnings:
-        return Check(name, "none", "none", Verdict.PASS)
-    return Check(name, "; ".join(o.warnings[:5]), "none", Verdict.WARNING, remedy)
+def _check(name: str, value: str, limit: str, verdict: Verdict, remedy: str) -> Check:
+    """Return a check; one that passes needs no remedy."""
+    return Check(name, value, limit, verdict, "" if verdict is Verdict.PASS else remedy)
 
 
 def _failures(o: Observation) -> Iterator[Check]:
     total = sum(o.failures.values()) + len(o.ranges)
     for cause, count in o.failures.items():
-        verdict = (
-            Verdict.FAIL if count > 0.5 * total else Verdict.WARNING if count > 0.05 * total else Verdict.PASS
-        )
-        remedy = "" if verdict is Verdict.PASS else o.remedies.get(cause, "send this report")
-        yield Check(f"failed exchanges: {cause}", f"{count} of {total}", "at most 5 %", verdict, remedy)
+        remedy = o.remedies.get(cause, "send this report")
+        verdict = _judge("", count / max(total, 1), 0.05, 0.5, "", remedy).verdict
+        yield _check(f"failed exchanges: {cause}", f"{count} of {total}", "at most 5 %", verdict, remedy)
 
 
 def _recovery(o: Observation) -> Check:
@@ -165,7 +160,7 @@ def _judge(
     scale = 100 if unit == "%" else 1
     limit = f"{bound} {scale * warn:g} {unit}".rstrip()
     shown = f"{scale * value:.3g} {unit}".rstrip()
-    return Check(name, shown, limit, verdict, "" if verdict is Verdict.PASS else remedy)
+    return _check(name, shown, limit, verdict, remedy)
 
 
 def _settings(written: Mapping[str, object], read: Mapping[str, object]) -> Iterator[Check]:
@@ -173,8 +168,8 @@ def _settings(written: Mapping[str, object], read: Mapping[str, object]) -> Iter
         answer = read.get(name)
         verdict = Verdict.PASS if answer == value else Verdict.WARNING if answer is None else Verdict.FAIL
         shown = "not answered" if answer is None else str(answer)
-        remedy = "" if verdict is Verdict.PASS else "the radio did not accept the value that was written"
-        yield Check(f"read back: {name}", shown, str(value), verdict, remedy)
+        remedy = "the radio did not accept the value that was written"
+        yield _check(f"read back: {name}", shown, str(value), verdict, remedy)
 
 
 def _ids(o: Observation) -> Check:
@@ -188,8 +183,8 @@ def _ids(o: Observation) -> Check:
     )
     if o.foreign:
         shown += f"; {o.foreign} ranges of other addresses"
-    remedy = "" if good else "switch other radios off, and check that the ids are not swapped"
-    return Check("ids", shown, expected, Verdict.PASS if good else Verdict.FAIL, remedy)
+    remedy = "switch other radios off, and check that the ids are not swapped"
+    return _check("ids", shown, expected, Verdict.PASS if good else Verdict.FAIL, remedy)
 
 
 def _ranges(o: Observation) -> Iterator[Check]:

@@ -150,8 +150,8 @@ def share_bar(name: str) -> Iterator[Callable[[float], None]]:
 
 
 @contextlib.contextmanager
-def step_bar(name: str, steps: int) -> Iterator[Callable[[], None]]:
-    """Show a progress bar with remaining time; yield a function to call after each step."""
+def step_bar(name: str, steps: int | None = None) -> Iterator[Callable[[], None]]:
+    """Show a progress bar with remaining time if the number of steps is known; yield a function to call after each."""
     with progress() as bar:
         task = bar.add_task(name, total=steps)
         yield lambda: bar.advance(task)
@@ -253,6 +253,6 @@ def _check_json_target(path: Path | None) -> Path | None:
 JsonOption = Annotated[
     Path | None,
     typer.Option(
-        "--json", metavar="FILE", callback=_check_json_target, help="Also write the result to FILE as JSON."
+        "--json", metavar="FILE", callback=_check_json_target, help="Also write the result as JSON."
     ),
 ]
