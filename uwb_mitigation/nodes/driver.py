@@ -77,7 +77,7 @@ class Driver(ManagedNode):
         self._feed = self._make_feed = None
         if self._has_finished:
             # Not earlier: after a crash before the bag is complete, the recording is replayed again.
-            self._respawn_state.save_exit_code(self.exit_code)
+            self._respawn_state.save(self.exit_code)
 
     def describe(self) -> Description:
         return ("none", diagnostics.OK, "", {}) if self._feed is None else self._feed.describe()

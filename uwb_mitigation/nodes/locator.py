@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from geometry_msgs.msg import PoseWithCovarianceStamped, Quaternion, Transform, TransformStamped, Vector3
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -22,7 +22,13 @@ from visualization_msgs.msg import MarkerArray
 
 from uwb_mitigation.errors import MissingDependencyError, ParameterError, RecordingError, format_id
 from uwb_mitigation.nodes import markers
-from uwb_mitigation.nodes.robot_motion import HOLD_S, MotionState, OdometryInput, transform_type
+from uwb_mitigation.nodes.robot_motion import (
+    HOLD_S,
+    MotionState,
+    OdometryInput,
+    make_transform,
+    transform_type,
+)
 from uwb_mitigation.nodes.support import diagnostics, endpoints
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode
 from uwb_mitigation.nodes.support.respawn import StateFile
@@ -48,6 +54,7 @@ from uwb_mitigation.types.ros.poses import (
     prepare_encoders,
     tag_frame,
     tag_of_frame,
+    tag_topic,
 )
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Estimate, Heading
@@ -70,17 +77,13 @@ _REPEAT_AFTER_NS = 300_000_000
 class _Outputs:
     """The publishers of one tag, its frame, and the stamps of its last poses.
 
-    `robot` is the estimator of the tag if a robot with odometry carries it.
+    `robot` is the estimator of the tag if a robot with odometry carries it; `number`: see `tag_topic`.
     """
 
-    def __init__(self, node: Locator, tag: TagState, prefix: str, frame: str) -> None:
-        def publisher(kind: type, topic: str) -> Publisher:
-            head, _, tail = topic.rpartition("/")
-            return node.publisher(kind, f"{head}/{prefix}{tail}")
-
-        self.pose = publisher(PoseWithCovarianceStamped, topics.POSE)
-        self.odometry = publisher(Odometry, topics.ODOMETRY)
-        self.smoothed = publisher(PoseWithCovarianceStamped, topics.POSE_SMOOTHED)
+    def __init__(self, node: Locator, tag: TagState, number: int | None, frame: str) -> None:
+        self.pose = node.publisher(PoseWithCovarianceStamped, tag_topic(topics.POSE, number))
+        self.odometry = node.publisher(Odometry, tag_topic(topics.ODOMETRY, number))
+        self.smoothed = node.publisher(PoseWithCovarianceStamped, tag_topic(topics.POSE_SMOOTHED, number))
         self.frame = frame
         self.robot = tag.robot
         self.picture = markers.TagPicture(frame)
@@ -303,10 +306,10 @@ class Locator(ManagedNode):
         if outputs is None:
             self._plain_tag = self._plain_tag or tag.tag_id
             plain = tag.tag_id == self._plain_tag
-            name = tag_frame(tag.tag_id)
+            name = self._plain_frame if plain else tag_frame(tag.tag_id)
             # Tags of several robots share the map, so the namespace keeps their frames apart.
-            frame = f"{self.get_namespace()}/{self._plain_frame if plain else name}".lstrip("/")
-            outputs = _Outputs(self, tag, "" if plain else f"{name}/", frame)
+            frame = f"{self.get_namespace()}/{name}".lstrip("/")
+            outputs = _Outputs(self, tag, None if plain else tag.tag_id, frame)
             for publisher in outputs.all():
                 publisher.on_activate(None)
             self._outputs[tag.tag_id] = outputs
@@ -333,13 +336,8 @@ class Locator(ManagedNode):
         outputs.pose.publish(encode_pose(base, self._map))
         outputs.odometry.publish(encode_odometry(estimate, self._map, outputs.frame))
         if self._tf is not None:
-            x, y, z = estimate.position.tolist()
-            transform = TransformStamped(
-                header=endpoints.header(estimate.stamp_ns, self._map),
-                child_frame_id=outputs.frame,
-                transform=Transform(translation=Vector3(x=x, y=y, z=z), rotation=Quaternion(w=1.0)),
-            )
-            self._publish_transform(transform, estimate.stamp_ns)
+            pose = estimate.stamp_ns, self._map, outputs.frame, estimate.position.tolist()
+            self._publish_transform(make_transform(*pose), estimate.stamp_ns)
 
     def _publish_base(self, outputs: _Outputs, base: Estimate) -> None:
         """Publish the pose of the robot, and the transform from map to odom."""

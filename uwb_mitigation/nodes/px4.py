@@ -54,7 +54,6 @@ OTHER_TAG, UNKNOWN_ANCHOR = "of other tags", "anchor not in the file"
 MAX_IDS = 10
 """Number of tags, and of unknown anchors, that are named."""
 
-_NAN3 = (math.nan,) * 3
 _QOS = QoSProfile(depth=10)
 
 
@@ -78,22 +77,25 @@ class Px4(ManagedNode):
                 valid="build the branch of https://github.com/PX4/px4_msgs for your firmware, and source its workspace",
             ) from error
         self._messages: Any = messages
-        self._sent = 0
-        self._latest_ns: int | None = None
         self._resets = 0
         self._publisher: Publisher
-        self._tag = 0
-        self._tags: set[int] = set()
         self._anchors: AnchorMap
+        self._forget()
+        self.autostart()
+
+    def _forget(self) -> None:
+        """Begin without earlier positions and ranges."""
+        self._sent = 0
+        self._latest_ns: int | None = None
+        self._tags: set[int] = set()
         self._positions: NDArray[np.float64] | None = None
         self._waiting: dict[int, tuple[int, RangeCorrected]] = {}
         self._last_ns: dict[int, int] = {}
         self._unknown: set[int] = set()
         self._counts: Counter[str] = Counter()
-        self.autostart()
 
     def open(self) -> None:
-        self._latest_ns, self._sent = None, 0
+        self._forget()
         if self.value("mode") == "ranges":
             self._open_ranges()
         else:
@@ -131,9 +133,7 @@ class Px4(ManagedNode):
         if not self.value("anchors"):
             raise ParameterError("parameter anchors is empty", valid="anchors:=FILE for mode:=ranges")
         self._anchors = load_anchors(Path(self.value("anchors")).expanduser())
-        self._tag, self._positions = self.value("tag"), None
-        self._waiting, self._last_ns, self._unknown, self._tags = {}, {}, set(), set()
-        self._counts = Counter()
+        self._tag = self.value("tag")
         if self.value("origin"):
             self._place_anchors(parse_origin(self.value("origin")))
         else:
@@ -214,23 +214,20 @@ class Px4(ManagedNode):
         row = self._anchors.index[anchor]
         latitude, longitude, altitude = self._positions[row].tolist()
         kind = self._messages.RangingBeacon
-        self._sent += 1
-        self._publisher.publish(
-            kind(
-                timestamp=self.get_clock().now().nanoseconds // 1000,
-                timestamp_sample=sent_ns // 1000,
-                # The field has 8 bits: larger ids are numbered in the order of the file.
-                beacon_id=anchor if max(self._anchors.index) < 256 else row + 1,
-                range=message.range,
-                lat=latitude,
-                lon=longitude,
-                alt=altitude,
-                alt_type=kind.ALT_TYPE_MSL,
-                hacc=float(self._anchors.sd[row]),
-                vacc=float(self._anchors.sd[row]),
-                sequence_nr=message.sequence % 256,
-                range_accuracy=max(math.sqrt(message.variance * increase), MIN_SD_M),
-            )
+        self._send(
+            kind,
+            sent_ns,
+            # The field has 8 bits: larger ids are numbered in the order of the file.
+            beacon_id=anchor if max(self._anchors.index) < 256 else row + 1,
+            range=message.range,
+            lat=latitude,
+            lon=longitude,
+            alt=altitude,
+            alt_type=kind.ALT_TYPE_MSL,
+            hacc=float(self._anchors.sd[row]),
+            vacc=float(self._anchors.sd[row]),
+            sequence_nr=message.sequence % 256,
+            range_accuracy=max(math.sqrt(message.variance * increase), MIN_SD_M),
         )
 
     def _on_pose(self, pose: PoseWithCovarianceStamped) -> None:
@@ -252,21 +249,22 @@ class Px4(ManagedNode):
         # After a gap, or if a replay starts again, the position may be elsewhere: EKF2 must not reject it as an outlier.
         self._resets += is_reset
         self._latest_ns = stamp_ns
-        self._sent += 1
         kind = self._messages.VehicleOdometry
-        self._publisher.publish(
-            kind(
-                timestamp=self.get_clock().now().nanoseconds // 1000,
-                timestamp_sample=stamp_ns // 1000,
-                pose_frame=kind.POSE_FRAME_NED,
-                position=values,
-                q=(math.nan,) * 4,
-                velocity_frame=kind.VELOCITY_FRAME_UNKNOWN,
-                velocity=_NAN3,
-                angular_velocity=_NAN3,
-                position_variance=[variance * increase for variance in variances],
-                orientation_variance=_NAN3,
-                velocity_variance=_NAN3,
-                reset_counter=self._resets % 256,
-            )
+        unknown = ("velocity", "angular_velocity", "orientation_variance", "velocity_variance")
+        self._send(
+            kind,
+            stamp_ns,
+            pose_frame=kind.POSE_FRAME_NED,
+            position=values,
+            q=(math.nan,) * 4,
+            velocity_frame=kind.VELOCITY_FRAME_UNKNOWN,
+            position_variance=[variance * increase for variance in variances],
+            reset_counter=self._resets % 256,
+            **dict.fromkeys(unknown, (math.nan,) * 3),
         )
+
+    def _send(self, kind: Any, stamp_ns: int, **values: Any) -> None:
+        """Publish a message of PX4, whose times are in microseconds."""
+        self._sent += 1
+        now_us = self.get_clock().now().nanoseconds // 1000
+        self._publisher.publish(kind(timestamp=now_us, timestamp_sample=stamp_ns // 1000, **values))

@@ -262,14 +262,8 @@ class OdometryInput:
         if last is None or not 0 <= stamp_ns - self.state.map_to_odom_ns <= HOLD_S * NS_PER_S:
             return None
         x, y, z, yaw = last
-        return TransformStamped(
-            header=endpoints.header(stamp_ns + tolerance_ns, self._map),
-            child_frame_id=self.state.odom_frame,
-            transform=Transform(
-                translation=Vector3(x=x, y=y, z=z),
-                rotation=Quaternion(z=math.sin(yaw / 2.0), w=math.cos(yaw / 2.0)),
-            ),
-        )
+        valid_ns = stamp_ns + tolerance_ns
+        return make_transform(valid_ns, self._map, self.state.odom_frame, (x, y, z), yaw)
 
     def map_to_odom(self, base: Estimate, tolerance_ns: int) -> TransformStamped | None:
         """Return the transform from map to odom for an estimate of the base, valid for `tolerance_ns` longer.
@@ -369,6 +363,14 @@ def _rotate(quaternion: tuple[float, ...], point: Vector) -> Vector:
     turned = np.cross(axis, point)
     x, y, z = (np.asarray(point) + 2.0 * (w * turned + np.cross(axis, turned))).tolist()
     return x, y, z
+
+
+def make_transform(stamp_ns: int, parent: str, child: str, xyz: Vector, yaw: float = 0.0) -> TransformStamped:
+    """Return a transform: the position (m) and the yaw (rad) of the child frame in the parent frame."""
+    x, y, z = xyz
+    rotation = Quaternion(z=math.sin(yaw / 2.0), w=math.cos(yaw / 2.0))
+    pose = Transform(translation=Vector3(x=x, y=y, z=z), rotation=rotation)
+    return TransformStamped(header=endpoints.header(stamp_ns, parent), child_frame_id=child, transform=pose)
 
 
 def transform_type() -> Any:

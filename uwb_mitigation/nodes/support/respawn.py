@@ -43,17 +43,14 @@ class RespawnState:
         text = path.read_text(encoding="ascii") if path is not None and path.is_file() else None
         self.is_respawned = text is not None
         self.exit_code = int(text) if text else None
-        self._write(text or "")
+        self.save(self.exit_code)
 
-    def save_exit_code(self, code: int) -> None:
-        """Let a process that replaces this one end with the same exit code."""
-        self._write(str(code))
-
-    def _write(self, text: str) -> None:
+    def save(self, exit_code: int | None) -> None:
+        """Let a process that replaces this one end with the same exit code; None: it continues."""
         if self._path is not None:
             # Without the file, a respawned driver only starts from scratch.
             with contextlib.suppress(OSError):
-                self._path.write_text(text, encoding="ascii")
+                self._path.write_text("" if exit_code is None else str(exit_code), encoding="ascii")
 
 
 def unused_path(path: Path) -> Path:
