@@ -138,7 +138,7 @@ typedef struct {
     uint32_t model_id; /* identity of the model that corrected; 0 = none */
     float range; /* m, corrected; NaN = no valid range */
     float range_raw; /* m, as measured */
-    float correction; /* m, offset + predicted error; only the offset if the range is passed through */
+    float correction; /* m, offset + predicted error; only the offset if it is passed through */
     float variance; /* m^2; infinite if the range is invalid */
     uint32_t compute_us; /* time that the correction took on the board */
     uint8_t status; /* 0 OK, 1 NO_CIR, 2 BAD_CIR, 3 OUT_OF_DISTRIBUTION, 4 MODEL_ERROR, 5 UNRELIABLE */
@@ -179,7 +179,7 @@ typedef struct {
     uint32_t antenna_delay; /* ticks, TX + RX; 0 = OTP value */
     uint32_t tx_power; /* register TX_POWER in smart-power format; 0 = OTP value, or that of the manual */
     uint32_t reply_us; /* from the reception of ANSWER to FINAL; 0 in SET_RADIO = default of the firmware */
-    uint32_t timeout_us; /* timeout of a tag for the frames of an anchor; 0 in SET_RADIO = default of the firmware */
+    uint32_t timeout_us; /* timeout of a tag for an anchor; 0 in SET_RADIO = default of the firmware */
     uint32_t interval_us; /* minimum time between the starts of two exchanges */
     uint16_t pan; /* network; frames of other networks are ignored */
     uint16_t rate; /* kbit/s: 110, 850, 6800 */
@@ -237,7 +237,7 @@ typedef struct {
     uint32_t antenna_delay; /* ticks, TX + RX; 0 = OTP value */
     uint32_t tx_power; /* register TX_POWER in smart-power format; 0 = OTP value, or that of the manual */
     uint32_t reply_us; /* from the reception of ANSWER to FINAL; 0 in SET_RADIO = default of the firmware */
-    uint32_t timeout_us; /* timeout of a tag for the frames of an anchor; 0 in SET_RADIO = default of the firmware */
+    uint32_t timeout_us; /* timeout of a tag for an anchor; 0 in SET_RADIO = default of the firmware */
     uint32_t interval_us; /* minimum time between the starts of two exchanges */
     uint16_t pan; /* network; frames of other networks are ignored */
     uint16_t rate; /* kbit/s: 110, 850, 6800 */

@@ -43,6 +43,8 @@ FAILURE_SHARE = 0.2
 
 _READ_BYTES = 1 << 16
 
+_Port = TypeVar("_Port", bound="RadioPort")
+
 OnEvent = Callable[[Any], None]
 """Called with each event, from the thread of the port."""
 
@@ -172,9 +174,10 @@ class RadioPort(ABC):
         self._logged_problem, self._problem_since_s = "", 0.0
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
-    def start(self) -> None:
-        """Start the thread."""
+    def start(self: _Port) -> _Port:
+        """Start the thread, and return the port."""
         self._thread.start()
+        return self
 
     @property
     def problem(self) -> str:
@@ -288,16 +291,6 @@ class RadioPort(ABC):
             self._log_problem(lasts=is_repeated)
             self._stop.wait(retry_s)
             retry_s = min(2 * retry_s, MAX_RETRY_S)
-
-
-_Port = TypeVar("_Port", bound=RadioPort)
-
-
-def started(ports: list[_Port]) -> list[_Port]:
-    """Start the ports and return them."""
-    for port in ports:
-        port.start()
-    return ports
 
 
 @dataclass(frozen=True)
@@ -415,7 +408,7 @@ def stream_opener(make_port: Callable[[Any, StreamPlace], Any], kind: str = "") 
         path = settings[0].capture
         capture = CaptureWriter(path, kind, len(settings)) if path is not None else None
         places = [(number, capture, on_event, stamp_clock) for number in range(len(settings))]
-        return started(list(map(make_port, settings, places)))
+        return [port.start() for port in list(map(make_port, settings, places))]
 
     return open
 

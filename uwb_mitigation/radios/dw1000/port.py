@@ -12,7 +12,7 @@ from typing import Any
 from uwb_mitigation.errors import ParameterError, format_id
 from uwb_mitigation.radios.dw1000.bus import Bus
 from uwb_mitigation.radios.dw1000.native import NativeRadio, load_native
-from uwb_mitigation.radios.port import ExchangeMonitor, OnEvent, PortReport, RadioPort, started
+from uwb_mitigation.radios.port import ExchangeMonitor, OnEvent, PortReport, RadioPort
 from uwb_mitigation.radios.settings import (
     DEFAULT_RADIO,
     EXCHANGE_REMEDIES,
@@ -71,7 +71,8 @@ def open_chips(
     stamp_clock: Callable[[], int] = time.time_ns,
 ) -> list[ChipPort]:
     """Open radios; see `ChipPort` for the events and errors."""
-    return started([ChipPort(chip, partial(open_bus, chip), on_event, stamp_clock) for chip in settings])
+    ports = [ChipPort(chip, partial(open_bus, chip), on_event, stamp_clock) for chip in settings]
+    return [port.start() for port in ports]
 
 
 class ChipPort(RadioPort):

@@ -10,7 +10,7 @@ import os
 from collections import Counter
 from collections.abc import Generator, Iterable, Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.files import read_bounded, write_atomically
@@ -59,8 +59,10 @@ class OriginalsFile:
             if board and not self._path.exists():
                 (other,) = filter(_is_unused, self._folder.glob(f"{_digest(board)}-*.json"))
                 other.replace(self._path)
-            keys = _read(self._path)["keys"]
-            return {str(key): (int(first), [*map(int, written)]) for key, (first, written) in keys.items()}
+            document = json.loads(read_bounded(self._path, MAX_BYTES, UwbMitigationError))
+            if document["format"] == FORMAT:
+                keys = document["keys"].items()
+                return {str(key): (int(first), [*map(int, written)]) for key, (first, written) in keys}
         return {}
 
     def save(self, changes: Changes) -> None:
@@ -81,25 +83,15 @@ class OriginalsFile:
             self._lock.close()
 
 
-def _lock_path(path: Path) -> Path:
-    return path.with_name(f"{path.stem.partition('-')[2]}.lock")
-
-
 def _is_unused(path: Path) -> bool:
     """Return whether no process uses the port of a file."""
+    port = path.stem.partition("-")[2]
     try:
-        with _lock_path(path).open("a") as lock:
+        with path.with_name(f"{port}.lock").open("a") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     return True
-
-
-def _read(path: Path) -> dict[str, Any]:
-    document: dict[str, Any] = json.loads(read_bounded(path, MAX_BYTES, UwbMitigationError))
-    if document["format"] != FORMAT:
-        raise ValueError(document["format"])
-    return document
 
 
 def _digest(text: str) -> str:

@@ -134,11 +134,7 @@ _RADIO_SETTINGS = (
     Field("antenna_delay", "I", "ticks, TX + RX; 0 = OTP value"),
     Field("tx_power", "I", "register TX_POWER in smart-power format; 0 = OTP value, or that of the manual"),
     Field("reply_us", "I", "from the reception of ANSWER to FINAL; 0 in SET_RADIO = default of the firmware"),
-    Field(
-        "timeout_us",
-        "I",
-        "timeout of a tag for the frames of an anchor; 0 in SET_RADIO = default of the firmware",
-    ),
+    Field("timeout_us", "I", "timeout of a tag for an anchor; 0 in SET_RADIO = default of the firmware"),
     Field("interval_us", "I", "minimum time between the starts of two exchanges"),
     Field("pan", "H", "network; frames of other networks are ignored"),
     Field("rate", "H", "kbit/s: 110, 850, 6800"),
@@ -228,9 +224,7 @@ _TABLES = (
         Field("model_id", "I", "identity of the model that corrected; 0 = none"),
         Field("range", "f", "m, corrected; NaN = no valid range"),
         Field("range_raw", "f", "m, as measured"),
-        Field(
-            "correction", "f", "m, offset + predicted error; only the offset if the range is passed through"
-        ),
+        Field("correction", "f", "m, offset + predicted error; only the offset if it is passed through"),
         Field("variance", "f", "m^2; infinite if the range is invalid"),
         Field("compute_us", "I", "time that the correction took on the board"),
         Field("status", "B", "0 OK, 1 NO_CIR, 2 BAD_CIR, 3 OUT_OF_DISTRIBUTION, 4 MODEL_ERROR, 5 UNRELIABLE"),
