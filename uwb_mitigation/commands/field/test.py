@@ -22,7 +22,7 @@ from uwb_mitigation.radios import evb1000, lines, serial, spi, uci
 from uwb_mitigation.radios.dw1000.port import ChipPort
 from uwb_mitigation.radios.evb1000 import Evb1000Bus
 from uwb_mitigation.radios.lines import LinePort
-from uwb_mitigation.radios.port import OnEvent, PortAddress, RadioPort
+from uwb_mitigation.radios.port import PortAddress, RadioPort
 from uwb_mitigation.radios.serial import BoardPort
 from uwb_mitigation.radios.settings import DEFAULT_RADIO, PortMessage, RadioSettings
 from uwb_mitigation.radios.spi import SpidevBus
@@ -90,8 +90,13 @@ def observe(
         if source != "spi" and not lines.parse_address(port).find():
             raise LinkError("is not there", where=port, valid="connect the board")
     events: SimpleQueue[object] = SimpleQueue()
+    # The default parameters of the driver.
+    values = {row.name: row.default for row in DRIVER}
+    values |= {"source": source, "port": ",".join(ports), "map": mapping, "capture": str(capture)}
+    _, module = SOURCES[source]
+    settings = module.read_settings(values.__getitem__)
     with ExitStack() as stack:
-        radios = _open(source, ports, mapping, capture, lambda event: events.put(event))
+        radios: Sequence[RadioPort] = module.open(settings, events.put)
         for radio in radios:
             stack.enter_context(closing(radio))
         collector = _Collector(radios, events, observation, on_warning)
@@ -160,17 +165,6 @@ class _Collector:
 
 def _kind(warning: str) -> str:
     return re.sub(r"[\d.]+", "", warning)
-
-
-def _open(
-    source: str, ports: list[str], mapping: str, capture: Path, on_event: OnEvent
-) -> Sequence[RadioPort]:
-    """Open the radios with the default parameters of the driver."""
-    values = {row.name: row.default for row in DRIVER}
-    values |= {"source": source, "port": ",".join(ports), "map": mapping, "capture": str(capture)}
-    _, module = SOURCES[source]
-    opened: Sequence[RadioPort] = module.open(module.read_settings(values.__getitem__), on_event)
-    return opened
 
 
 def _values(settings: RadioSettings) -> dict[str, object]:

@@ -115,8 +115,7 @@ class NativeRadio:
     @property
     def settings(self) -> RadioSettings:
         """Active settings; contains the chip's own values once it has started."""
-        radio = self._decoded(MessageType.RADIO, self._library.native_radio_settings)
-        assert isinstance(radio, RadioConfigured)
+        radio: RadioConfigured = self._decoded(MessageType.RADIO, self._library.native_radio_settings)
         return radio.settings
 
     def read_sensors(self) -> None:
@@ -129,8 +128,7 @@ class NativeRadio:
 
     def status(self) -> RadioStatus:
         """Return the status: state and counts."""
-        status = self._decoded(MessageType.RADIO_STATUS, self._library.native_radio_status)
-        assert isinstance(status, RadioStatus)
+        status: RadioStatus = self._decoded(MessageType.RADIO_STATUS, self._library.native_radio_status)
         return status
 
     def close(self) -> None:
@@ -145,7 +143,7 @@ class NativeRadio:
         _, payload = messages.encode(SetRadio(settings))
         return payload, len(payload), self._bus.reply_us, self._bus.timeout_us
 
-    def _decoded(self, kind: MessageType, write: Callable[..., int]) -> messages.Message:
+    def _decoded(self, kind: MessageType, write: Callable[..., int]) -> Any:
         """Return the message whose payload a function writes."""
         count = write(self._radio, self._payload)
         return messages.decode(kind, self._payload.raw[:count])
