@@ -370,7 +370,8 @@ def test_driver_records_its_ranges_and_never_replaces_a_file(ros: Ros, tmp_path:
 def test_respawned_driver_records_to_a_new_file_and_does_not_repeat_a_recording_that_ended(
     ros: Ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    (tmp_path / "respawn").mkdir()
+    for name in ("respawn", "live_2.mcap"):
+        (tmp_path / name).mkdir()
     monkeypatch.setenv(RESPAWN_FOLDER, str(tmp_path / "respawn"))
     options = (
         "wait_for_subscribers:=0",
@@ -399,8 +400,8 @@ def test_respawned_driver_records_to_a_new_file_and_does_not_repeat_a_recording_
     new_launch = ros.start("driver", *options)
     assert new_launch.wait() == 1
     assert "an unfinished recording exists" in new_launch.output
-    assert {file.name for file in tmp_path.glob("live*")} == {"live.mcap.part", "live_2.mcap"}
-    with McapRecording(tmp_path / "live_2.mcap") as recording:
+    assert {file.name for file in tmp_path.glob("live*")} == {"live.mcap.part", "live_2.mcap", "live_3.mcap"}
+    with McapRecording(tmp_path / "live_3.mcap") as recording:
         assert len(list(recording)) == 40
 
 

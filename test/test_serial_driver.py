@@ -27,8 +27,7 @@ from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.radios import serial as serial_source
 from uwb_mitigation.radios.port import PortAddress
 from uwb_mitigation.radios.serial import BoardPort, SerialSettings
-from uwb_mitigation.radios.settings import PortMessage, RadioSettings, Role
-from uwb_mitigation.radios.wire.events import Disconnected, Loss
+from uwb_mitigation.radios.settings import RadioSettings, Role
 from uwb_mitigation.radios.wire.framing import FrameEncoder
 from uwb_mitigation.radios.wire.messages import Hello, RadioConfigured
 from uwb_mitigation.simulation.simulated import SimulatedSource
@@ -187,12 +186,16 @@ def test_signal_ends_the_driver_immediately_in_any_state(ros: Ros, link: Path, s
     """`test_unusable_port_is_logged_once` ends it without a board."""
     with board(link) as device:
         driver = drive(ros, link)
-        ros.diagnosis("driver", lambda s: True)
+        driver.wait_for_output("connected to board")
         if state == "flooding":
             device.flood(60)
         ros.spin_for(0.3)
+        lost = driver.output.count("disconnected")
         assert driver.signal(signal.SIGTERM) == 0, driver.output
         assert "Traceback" not in driver.output
+        assert state == "flooding" or driver.output.count("disconnected") == lost, (
+            "it has closed the port itself"
+        )
 
 
 def test_board_corrects_as_the_host_with_the_offsets_of_the_driver(ros: Ros, link: Path):
@@ -271,13 +274,3 @@ def test_board_of_another_protocol_version_is_a_problem_that_names_it():
     port._received(FrameEncoder(version=9).encode(1, b""), 0, 0)
     port._received(b"", 4 * 10**9, 0)
     assert port.report().problem == "the board uses another protocol version: 9"
-
-
-def test_loss_of_a_board_is_logged_unless_its_port_is_closed():
-    port = BoardPort(SerialSettings(PortAddress("/dev/no")), (0, None, print, time.time_ns))
-    assert [type(event) for event in port._observed([Disconnected(Loss.RESET)])] == [
-        Disconnected,
-        PortMessage,
-    ]
-    port.request_close()
-    assert [type(event) for event in port._observed([Disconnected(Loss.CLOSED)])] == [Disconnected]
