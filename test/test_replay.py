@@ -327,15 +327,9 @@ def test_late_records_are_published_in_batches_and_in_order():
     assert player.batches[0] == 1
 
 
-@pytest.fixture(scope="session")
-def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("replay") / "simulated.mcap"
-    source = SimulatedSource(seed=1, count=COUNT, rate_hz=100.0)
-    return write_records(path, source, source=source.name)
-
-
 @pytest.mark.ros
-def test_parameters_pause_seek_and_speed_up_a_running_replay(ros: Ros, bag: Path):
+def test_parameters_pause_seek_and_speed_up_a_running_replay(ros: Ros, tmp_path: Path):
+    bag = write_records(tmp_path / "bag.mcap", SimulatedSource(seed=1, count=COUNT, rate_hz=100.0))
     received = ros.collect(RangeCir, "/uwb/range_raw")
     clock = ros.collect(ClockMessage, "/clock")
     driver = ros.start(
