@@ -279,18 +279,15 @@ def smoothed(pairs, predicted_m, window=WINDOW, range_m=3.0, anchor=1):
     return result
 
 
-def test_pair_at_rest_gets_the_median_of_the_latest_predictions():
-    result = smoothed(PairsAtRest(), PREDICTED_M)
+@pytest.mark.parametrize("batch", [1, 5, len(PREDICTED_M)])
+def test_pair_at_rest_gets_the_median_of_the_latest_predictions(batch):
+    pairs = PairsAtRest()
+    starts = range(0, len(PREDICTED_M), batch)
+    result = np.concatenate([smoothed(pairs, PREDICTED_M[start : start + batch]) for start in starts])
     assert np.array_equal(result[: MIN_ALIKE - 1], PREDICTED_M[: MIN_ALIKE - 1])
     for end in range(MIN_ALIKE, len(PREDICTED_M) + 1):
         latest = np.sort(PREDICTED_M[max(0, end - LENGTH) : end])
         assert result[end - 1] == latest[len(latest) // 2]
-
-
-def test_result_does_not_depend_on_the_batches():
-    one_by_one = PairsAtRest()
-    single = np.concatenate([smoothed(one_by_one, [value]) for value in PREDICTED_M])
-    assert np.array_equal(single, smoothed(PairsAtRest(), PREDICTED_M))
 
 
 def test_median_ends_with_the_first_range_that_moved():
