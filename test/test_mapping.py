@@ -24,8 +24,7 @@ from uwb_mitigation.recordings.bag.odometry import read_odometry
 from uwb_mitigation.recordings.formats import open_mapped
 from uwb_mitigation.recordings.mapping.conversion import read_cir
 from uwb_mitigation.recordings.mapping.mapped import MappedRecording
-from uwb_mitigation.recordings.mapping.mapping import Mapping, TableFormat, load_mapping, shipped_mappings
-from uwb_mitigation.recordings.mapping.messages import MessageRows
+from uwb_mitigation.recordings.mapping.mapping import Mapping, load_mapping, shipped_mappings
 from uwb_mitigation.recordings.mcap import McapRecording
 from uwb_mitigation.types.measurement import Encoding
 
@@ -213,6 +212,9 @@ def test_a_bag_is_read_by_topic_and_field_path(tmp_path: Path):
     anchors = {"files": "anchors.csv", "id": "a", "position": ["x", 0, 0]}
     document = mapping.model_dump(exclude={"anchors"}) | {"anchors": anchors}
     assert len(read(document, tmp_path / "two/two.db3").anchors.index) == 2
+    lists = mapping.model_dump(exclude={"fields", "drop"}) | {"fields": {"anchor": 1, "range": "quaternion"}}
+    with pytest.raises(RecordingError, match=r"contains lists .*quaternion\[\]"):
+        read(lists, tmp_path / "two")
     with pytest.raises(RecordingError, match=r"the mapping has no topics \(the bag has: /nlink_link"):
         MappedRecording(mapping.model_copy(update={"topics": []}), tmp_path / "two")
 
@@ -280,64 +282,6 @@ def test_truncated_bag_is_read_up_to_the_damage(name: str, tmp_path: Path):
     with pytest.raises(DamagedRecordingError):
         list(source)
     assert "only the rows before are used" in source.warnings[0]
-
-
-TAGS = "uint8 role\nuint8 id\nfloat32[3] pos_3d\nfloat32[8] dis_arr\n"
-
-
-ANCHORFRAME = (
-    "uint8 role\nuint8 id\nuint32 local_time\nuint32 system_time\nfloat32 voltage\nLinktrackTag[] nodes\n"
-)
-
-
-def anchorframe(store: Typestore, second: int) -> Any:
-    distances = np.array([1.5, 0, 2.5, 0, 0, 0, 0, 0], np.float32)
-    tag = store.types["nlink_parser/msg/LinktrackTag"]
-    nodes = [tag(2, number, np.zeros(3, np.float32), distances) for number in (3, 4)]
-    return store.types["nlink_parser/msg/LinktrackAnchorframe0"](1, 0, 0, 0, 5.0, nodes)
-
-
-def test_linktrack_anchor_frames(tmp_path: Path):
-    types = {"LinktrackTag": TAGS, "LinktrackAnchorframe0": ANCHORFRAME}
-    write_bag(tmp_path / "bag", "/nlink_linktrack_anchorframe0", types, anchorframe)
-    found = [values[1:] for values in values_of(open_mapped(tmp_path / "bag", "nlink_anchorframe0"))]
-    assert found == [(3, 0, 1.5), (3, 2, 2.5), (4, 0, 1.5), (4, 2, 2.5)] * 3
-    # Without [] it is an error, not a traceback.
-    document = load_mapping("nlink_nodeframe2").model_dump(exclude={"fields", "drop", "topics"}) | {
-        "topics": ["/nlink_linktrack_anchorframe0"],
-        "fields": {"tag": "nodes[].id", "anchor": 1, "range": "nodes[].dis_arr"},
-    }
-    with pytest.raises(RecordingError, match=r"contains lists .*nodes\[\].dis_arr\[\]"):
-        read(document, tmp_path / "bag")
-
-
-ONE, TWO = {"id": 1, "dis_arr": [0.5, 0.6]}, {"id": 2, "dis_arr": [0.7]}
-
-
-UCI = "[addr=0x0001, status=OK, distance[cm]=23]; [addr=0x0002, status=OK, distance[cm]=45]"
-
-
-UCI_TABLE = TableFormat(pattern=r"addr=(?P<a>0x\w+), .*?distance\[cm\]=(?P<r>\d+)")
-
-
-@pytest.mark.parametrize(
-    ("table", "message", "rows"),
-    [
-        (
-            TableFormat(text="pairs"), "AT+RANGE=tid:4,id:(1, 2,3),range:[110,220,331]",
-            {"#": [0, 1, 2], "id[]": ["1", "2", "3"], "range[]": ["110", "220", "331"]},
-        ),
-        (
-            TableFormat(), {"id": 9, "nodes": [ONE, TWO]},
-            {"#": [0, 1, 0], "id": [9, 9, 9], "nodes[].id": [1, 1, 2], "nodes[].dis_arr[]": [0.5, 0.6, 0.7]},
-        ),
-        (UCI_TABLE, UCI, {"#": [0, 0], "a": ["0x0001", "0x0002"], "r": ["23", "45"]}),
-        (UCI_TABLE, "SESSION_STATUS", {"#": [], "a": [], "r": []}),
-    ],
-)  # fmt: skip
-def test_each_range_of_a_message_is_a_row(table: TableFormat, message: Any, rows: dict[str, list[Any]]):
-    columns = {name: False for name in rows if name != "#"}
-    assert MessageRows(table, columns).rows(message) == rows
 
 
 # Shipped mappings ------------------------------------------------------------------------------------------------

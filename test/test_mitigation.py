@@ -35,15 +35,22 @@ def _no_warnings():
 
 SHAPE = Remnet(samples=157)
 EMPTY = {"samples": np.zeros(0, np.int16)}
+SATURATED = [np.full(2032, edge, np.int16) for edge in (-32768, 32767)]
+MAGNITUDES = {"encoding": Encoding.MAGNITUDE}
 IN_DB = np.rint(20 * np.log10(np.random.default_rng(1).rayleigh(20.0, 1016) + 1)).astype(np.int16)
 BAD = [
     (EMPTY, 3.0, Status.NO_CIR, "no samples"),
     ({"samples": np.zeros(2032, np.int16)}, 3.0, Status.BAD_CIR, "only zeros"),
-    ({"samples": np.full(2032, -32768, np.int16)}, 3.0, Status.BAD_CIR, "saturated"),
-    ({"samples": IN_DB, "encoding": Encoding.MAGNITUDE}, 3.0, Status.BAD_CIR, "in dB"),
-    ({"encoding": Encoding.MAGNITUDE}, 3.0, Status.BAD_CIR, "negative"),
-    ({"first_path_index": math.nan}, 3.0, Status.BAD_CIR, "index is not finite"),
-    ({"scale": math.nan}, 3.0, Status.BAD_CIR, "NaN"),
+    ({"samples": np.ones(2033, np.int16)}, 3.0, Status.BAD_CIR, "odd number"),
+    *(({"samples": samples}, 3.0, Status.BAD_CIR, "saturated") for samples in SATURATED),
+    ({"samples": np.full(1016, 32767, np.int16)} | MAGNITUDES, 3.0, Status.BAD_CIR, "saturated"),
+    ({"samples": IN_DB} | MAGNITUDES, 3.0, Status.BAD_CIR, "in dB"),
+    ({"samples": np.int16(-np.eye(1, 1016, 750)[0])} | MAGNITUDES, 3.0, Status.BAD_CIR, "negative"),
+    *(({"first_path_index": index}, 3.0, Status.BAD_CIR, "not finite") for index in (math.nan, -math.inf)),
+    *(({"first_path_index": index}, 3.0, Status.BAD_CIR, "too short") for index in (4.99, 865.0)),
+    *(({"first_path_index": index}, 3.0, Status.BAD_CIR, "outside the CIR") for index in (1016.0, 1e300)),
+    ({"start_index": 2**31 - 1}, 3.0, Status.BAD_CIR, "outside the CIR"),
+    *(({"scale": scale}, 3.0, Status.BAD_CIR, "NaN, infinite") for scale in (0.0, math.nan, 1e38)),
     ({"preamble_count": 0}, 3.0, Status.BAD_CIR, "is unknown, and the model"),
     ({"rx_power_dbm": math.nan}, 3.0, Status.BAD_CIR, "power is unknown"),
     ({"first_path_power_dbm": math.nan}, 3.0, Status.BAD_CIR, "power is unknown"),
@@ -272,18 +279,15 @@ def smoothed(pairs, predicted_m, window=WINDOW, range_m=3.0, anchor=1):
     return result
 
 
-def test_pair_at_rest_gets_the_median_of_the_latest_predictions():
-    result = smoothed(PairsAtRest(), PREDICTED_M)
+@pytest.mark.parametrize("batch", [1, 5, len(PREDICTED_M)])
+def test_pair_at_rest_gets_the_median_of_the_latest_predictions(batch):
+    pairs = PairsAtRest()
+    starts = range(0, len(PREDICTED_M), batch)
+    result = np.concatenate([smoothed(pairs, PREDICTED_M[start : start + batch]) for start in starts])
     assert np.array_equal(result[: MIN_ALIKE - 1], PREDICTED_M[: MIN_ALIKE - 1])
     for end in range(MIN_ALIKE, len(PREDICTED_M) + 1):
         latest = np.sort(PREDICTED_M[max(0, end - LENGTH) : end])
         assert result[end - 1] == latest[len(latest) // 2]
-
-
-def test_result_does_not_depend_on_the_batches():
-    one_by_one = PairsAtRest()
-    single = np.concatenate([smoothed(one_by_one, [value]) for value in PREDICTED_M])
-    assert np.array_equal(single, smoothed(PairsAtRest(), PREDICTED_M))
 
 
 def test_median_ends_with_the_first_range_that_moved():

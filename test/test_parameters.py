@@ -18,7 +18,7 @@ from ros_harness import PAUSED, Ros, diagnostic_values, domain
 from uwb_mitigation_msgs.msg import RangeCir
 
 from uwb_mitigation.nodes.support.parameter_tables import RESPAWN_FOLDER, TABLES, Parameter
-from uwb_mitigation.nodes.support.respawn import StateFile, unused_path
+from uwb_mitigation.nodes.support.respawn import StateFile
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.measurement import Record
 
@@ -127,14 +127,6 @@ def test_state_of_a_crashed_node_is_loaded_once_and_only_if_it_is_new_and_valid(
         assert load() is None
     assert len(warnings) == 4
     assert StateFile(None, logger).load(30.0, dict) is None
-
-
-def test_file_after_a_crash_replaces_no_complete_or_partial_one(tmp_path: Path):
-    assert unused_path(tmp_path / "drive.mcap") == tmp_path / "drive.mcap"
-    for name in ("drive.mcap", "drive_2.mcap.part"):
-        (tmp_path / name).touch()
-    assert unused_path(tmp_path / "drive.mcap").name == "drive_3.mcap"
-    assert unused_path(Path("/dev/null")) == Path("/dev/null")
 
 
 def test_topics_can_be_remapped_and_the_frame_is_a_parameter(ros: Ros, tmp_path: Path):

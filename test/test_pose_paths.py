@@ -90,13 +90,8 @@ def odometry(second: int, child: str = "base_link") -> Any:
     return of("nav_msgs/msg/Odometry", header(second), child, sure, moving)
 
 
-def of_two_tags(second: int) -> Any:
-    """Return odometry of tag 7 in even seconds and of tag 8 in odd ones."""
-    return odometry(second, f"tag_{7 + second % 2}")
-
-
 def test_each_child_frame_is_a_body_of_its_own(tmp_path):
-    bag = write(tmp_path, "/odom", of_two_tags)
+    bag = write(tmp_path, "/odom", lambda second: odometry(second, f"tag_{7 + second % 2}"))
     bodies = read_bodies(bag, "/odom")
     assert {frame: path.position[:, 0].tolist() for frame, path in bodies.items()} == {
         "tag_7": [0.0, 2.0, 4.0, 6.0, 8.0],

@@ -312,11 +312,9 @@ def test_dask_cluster_gives_the_same_result_and_continues_after_an_invalid_bag(t
 
 
 def test_unreachable_scheduler_is_named(tmp_path: Path) -> None:
-    distributed = pytest.importorskip("distributed", reason="python -m pip install distributed")
-    import dask
-
+    pytest.importorskip("distributed", reason="python -m pip install distributed")
+    dask = pytest.importorskip("dask")
     with dask.config.set({"distributed.comm.timeouts.connect": "200ms"}):
         for address in ("tcp://127.0.0.1:9", "nonsense://127.0.0.1:9"):
             with pytest.raises(ParameterError, match="no Dask scheduler"):
                 list(run_on_dask([job(tmp_path / "a", tmp_path / "b")], address))
-    assert distributed

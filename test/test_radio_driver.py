@@ -36,10 +36,6 @@ def boards(tmp_path: Path) -> Iterator[EmulatedEvb1000s]:
         yield emulated
 
 
-def level_of(status: DiagnosticStatus) -> int:
-    return status.level[0] if isinstance(status.level, bytes) else status.level
-
-
 def test_tag_ranges_with_two_anchors_and_settings_are_applied_live(
     ros: ros_harness.Ros, boards: EmulatedEvb1000s, tmp_path: Path
 ):
@@ -52,7 +48,9 @@ def test_tag_ranges_with_two_anchors_and_settings_are_applied_live(
     assert message.cir.preamble_count > 0
     assert (message.cir.radio, message.cir.segment) == (Cir.DW1000, Cir.IPATOV)
     assert np.isfinite([message.range, message.cir.rx_power, message.cir.first_path_power]).all()
-    status = ros.diagnosis("driver", lambda status: level_of(status) == 0 and "ranging" in status.message)
+    status = ros.diagnosis(
+        "driver", lambda status: status.level == DiagnosticStatus.OK and "ranging" in status.message
+    )
     values = diagnostic_values(status)
     assert int(values["radio 0: ranged"]) > 0
     assert sum("anchor 0x" in key and "dBm" in value for key, value in values.items()) == 2
@@ -88,7 +86,9 @@ def test_board_without_radio_support_is_reported_and_keeps_running(ros: ros_harn
     raw = ros.collect(RangeCir, "/uwb/range_raw")
     with EmulatedBoard(SimulatedSource(seed=4, count=50), link=tmp_path / "board"):
         driver = ros.start("driver", "source:=serial", f"port:={tmp_path / 'board'}", "radio.pan:=7")
-        status = ros.diagnosis("driver", lambda status: level_of(status) == 2 and "flash" in status.message)
+        status = ros.diagnosis(
+            "driver", lambda status: status.level == DiagnosticStatus.ERROR and "flash" in status.message
+        )
         assert "the radio's settings are not used" in status.message
         driver.wait_for_output("the radio's settings are not used")
         count_before = len(raw)

@@ -1,9 +1,12 @@
-"""Driver and exchange of the firmware on modelled chips, in virtual time."""
+"""Driver and exchange of the firmware on modelled chips, and a host of a board with them, in virtual time."""
 
 from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,11 +14,14 @@ from compilers import NEEDS_CC
 
 from benchmarks.equipment.dw1000_model.boards import ModelledAir, SerialLink
 from benchmarks.equipment.dw1000_model.pairs import Pair
-from uwb_mitigation.radios.settings import PREAMBLES, RadioSettings, Role
+from uwb_mitigation.radios.port import PortAddress
+from uwb_mitigation.radios.serial import BoardPort, SerialSettings
+from uwb_mitigation.radios.settings import PREAMBLES, PortMessage, RadioSettings, Role
 from uwb_mitigation.radios.wire import messages
 from uwb_mitigation.radios.wire.events import Refused
 from uwb_mitigation.radios.wire.messages import SetRadio
 from uwb_mitigation.radios.wire.session import BoardSession
+from uwb_mitigation.types.measurement import RangeMeasurement
 
 pytestmark = NEEDS_CC
 
@@ -181,19 +187,54 @@ def test_power_dependent_bias_is_corrected_if_enabled():
     assert abs(rows["range_m"].mean() - 5 + bias_m) < 0.005
 
 
+# A host -----------------------------------------------------------------------------------------------------------
+
+
+def talk(air: ModelledAir, board: int, session: Any, seconds: float) -> list[Any]:
+    """Connect a board with the session of its host; return the events."""
+    events: list[Any] = []
+    for _ in range(round(seconds / 0.01)):
+        now_ns = round(air.run(0.01) * 1e9)
+        events += session.receive(air.read(board), now_ns, now_ns)
+        air.write(board, session.outgoing())
+    return events
+
+
 def test_settings_that_a_board_does_not_support_are_refused_with_a_reason():
     with ModelledAir() as air:
         board, session = air.add(RadioSettings(), serial_link=SerialLink()), BoardSession()
         session.opened(0)
-        events = []
-        for step in range(150):
-            if step == 50:
-                request = SetRadio(RadioSettings(channel=6))
-                assert messages.decode(*messages.encode(request)) == request
-                session._radio_request.begin(request)
-            now_ns = round(air.run(0.01) * 1e9)
-            events += session.receive(air.read(board), now_ns, now_ns)
-            air.write(board, session.outgoing())
-    (refusal,) = (event for event in events if isinstance(event, Refused))
+        talk(air, board, session, 0.5)
+        request = SetRadio(RadioSettings(channel=6))
+        assert messages.decode(*messages.encode(request)) == request
+        session._radio_request.begin(request)
+        (refusal,) = (event for event in talk(air, board, session, 1.0) if isinstance(event, Refused))
     assert "channel" in refusal.text
     assert session.radio.settings.channel == 5
+
+
+def test_settings_of_the_driver_are_applied_live_and_the_diagnostics_show_the_radio():
+    settings = SerialSettings(PortAddress("/dev/no"), radio=RadioSettings(window=40))
+    port = BoardPort(settings, (0, None, print, lambda: 0))
+    session = SimpleNamespace(receive=port._received, outgoing=port.session.outgoing)
+    with ModelledAir() as air:
+        tag = air.add(RadioSettings(), serial_link=SerialLink())
+        for distance_m, channel in ((5, {}), (9, {"channel": 2, "prf_mhz": 16})):
+            anchor = air.add(RadioSettings(role=Role.ANCHOR, **channel))
+            air.set_pair(tag, anchor, Pair(distance_m))
+        before, report = talk(air, tag, session, 3), port.report()
+        port.apply(replace(settings, radio=RadioSettings(channel=2, prf_mhz=16)))
+        after = talk(air, tag, session, 3)
+    first, second = (
+        [event for event in events if isinstance(event, RangeMeasurement)][-1] for events in (before, after)
+    )
+    assert (len(first.cir), round(first.range_m, 1)) == (40, 5.0)
+    assert (second.cir.prf_mhz, round(second.range_m, 1)) == (16, 9.0)
+    assert (report.values["radio: role"], report.values["radio: antenna delay"]) == ("tag", 2 * 16436)
+    assert int(report.values["radio: ranged"]) > 0
+    assert any("anchor 0x" in key and "dBm" in str(value) for key, value in report.values.items())
+    assert "radio" in report.hardware
+    texts = [
+        event.text for event in before + after if isinstance(event, PortMessage) and "kbit/s" in event.text
+    ]
+    assert ["channel 5, 6800 kbit/s" in texts[0], "channel 2, 6800 kbit/s" in texts[-1]] == [True, True]

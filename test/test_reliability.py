@@ -26,19 +26,8 @@ from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
-from uwb_mitigation.nodes.support.diagnostics import (
-    DROPPED,
-    MIN_LOS,
-    NO_RANGES,
-    NO_SEQUENCE_NUMBER,
-    NO_USABLE_CIR,
-    OFFSET,
-    OUT_OF_DISTRIBUTION,
-    SLOW,
-    LossCounter,
-    MitigatorHealth,
-    RateMonitor,
-)
+from uwb_mitigation.nodes.support import diagnostics
+from uwb_mitigation.nodes.support.diagnostics import LossCounter, MitigatorHealth
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.measurement import Status
 from uwb_mitigation.types.ros.codec import encode_range
@@ -96,7 +85,7 @@ def test_ranges_dropped_by_a_queue_are_reported(ros: Ros):
         # Send more than the queue can hold.
         for _ in range(300):
             publisher.publish(data)
-        return status.message == DROPPED.text
+        return status.message == diagnostics.DROPPED.text
 
     status = ros.diagnosis("mitigator", excerpt)
     assert status.level == DiagnosticStatus.WARN
@@ -149,7 +138,7 @@ def test_diagnostics_continue_while_simulated_time_is_paused(ros: Ros):
 
 def test_rate_is_counted_on_the_nodes_clock():
     now_ns = [0]
-    meter = RateMonitor(lambda: now_ns[0])
+    meter = diagnostics.RateMonitor(lambda: now_ns[0])
     for _ in range(50):
         meter.add(2_000_000)
     now_ns[0] = 5_000_000_000
@@ -174,9 +163,9 @@ def warnings(health: MitigatorHealth) -> list[str]:
     ("statuses", "expected"),
     [
         ({Status.OK: 100}, []),
-        ({Status.OK: 79, Status.OUT_OF_DISTRIBUTION: 21}, [OUT_OF_DISTRIBUTION.text]),
+        ({Status.OK: 79, Status.OUT_OF_DISTRIBUTION: 21}, [diagnostics.OUT_OF_DISTRIBUTION.text]),
         ({Status.OK: 89, Status.OUT_OF_DISTRIBUTION: 21}, []),
-        ({Status.OK: 79, Status.BAD_CIR: 11, Status.NO_CIR: 10}, [NO_USABLE_CIR.text]),
+        ({Status.OK: 79, Status.BAD_CIR: 11, Status.NO_CIR: 10}, [diagnostics.NO_USABLE_CIR.text]),
         ({Status.OK: 89, Status.BAD_CIR: 11, Status.NO_CIR: 10}, []),
     ],
 )
@@ -185,33 +174,33 @@ def test_many_ranges_of_a_bad_status_cause_a_warning(statuses: dict[Status, int]
 
 
 def test_slow_correction_and_no_data_cause_a_warning():
-    assert warnings(health(processing_ms=25.0)) == [SLOW.text]
+    assert warnings(health(processing_ms=25.0)) == [diagnostics.SLOW.text]
     now_s = [100.0]
     silent = health(now_s=lambda: now_s[0])
     now_s[0] = 106.0
-    assert warnings(silent) == [NO_RANGES.text]
+    assert warnings(silent) == [diagnostics.NO_RANGES.text]
 
 
 def test_drop_causes_one_warning():
     dropping = health()
     dropping.lost += 3
-    assert warnings(dropping) == [DROPPED.text]
+    assert warnings(dropping) == [diagnostics.DROPPED.text]
     assert warnings(dropping) == []
     assert dropping.dropped == 3
 
 
 def test_model_that_includes_an_offset_causes_a_warning_after_enough_ranges():
     health = MitigatorHealth()
-    health.los_m.extend([0.3] * (MIN_LOS - 1))
+    health.los_m.extend([0.3] * (diagnostics.MIN_LOS - 1))
     health.excludes_offset = True
-    assert OFFSET.text not in warnings(health)
+    assert diagnostics.OFFSET.text not in warnings(health)
     health.los_m.append(0.3)
-    assert OFFSET.text in warnings(health)
+    assert diagnostics.OFFSET.text in warnings(health)
     health.excludes_offset = False
-    assert OFFSET.text not in warnings(health)
+    assert diagnostics.OFFSET.text not in warnings(health)
     health.excludes_offset = True
     health.los_m.extend([-0.05] * 1000)
-    assert OFFSET.text not in warnings(health)
+    assert diagnostics.OFFSET.text not in warnings(health)
 
 
 @pytest.mark.parametrize("count", [2, 3, 5])
@@ -251,7 +240,7 @@ def test_restarted_publisher_counts_no_drops():
 
 def test_middleware_without_numbers_may_hide_drops():
     silent = health()
-    silent.loss_counter.add(NO_SEQUENCE_NUMBER)
+    silent.loss_counter.add(diagnostics.NO_SEQUENCE_NUMBER)
     silent.lost += 7
     assert silent.period()[1]["dropped by a queue"] == "7 or more"
 

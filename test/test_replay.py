@@ -327,15 +327,9 @@ def test_late_records_are_published_in_batches_and_in_order():
     assert player.batches[0] == 1
 
 
-@pytest.fixture(scope="session")
-def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("replay") / "simulated.mcap"
-    source = SimulatedSource(seed=1, count=COUNT, rate_hz=100.0)
-    return write_records(path, source, source=source.name)
-
-
 @pytest.mark.ros
-def test_parameters_pause_seek_and_speed_up_a_running_replay(ros: Ros, bag: Path):
+def test_parameters_pause_seek_and_speed_up_a_running_replay(ros: Ros, tmp_path: Path):
+    bag = write_records(tmp_path / "bag.mcap", SimulatedSource(seed=1, count=COUNT, rate_hz=100.0))
     received = ros.collect(RangeCir, "/uwb/range_raw")
     clock = ros.collect(ClockMessage, "/clock")
     driver = ros.start(
@@ -370,7 +364,8 @@ def test_driver_records_its_ranges_and_never_replaces_a_file(ros: Ros, tmp_path:
 def test_respawned_driver_records_to_a_new_file_and_does_not_repeat_a_recording_that_ended(
     ros: Ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    (tmp_path / "respawn").mkdir()
+    for name in ("respawn", "live_2.mcap"):
+        (tmp_path / name).mkdir()
     monkeypatch.setenv(RESPAWN_FOLDER, str(tmp_path / "respawn"))
     options = (
         "wait_for_subscribers:=0",
@@ -400,8 +395,8 @@ def test_respawned_driver_records_to_a_new_file_and_does_not_repeat_a_recording_
     assert new_launch.wait() == 1
     assert "an unfinished recording exists" in new_launch.output
     assert "an existing or unfinished file is refused" in help_text("driver")
-    assert {file.name for file in tmp_path.glob("live*")} == {"live.mcap.part", "live_2.mcap"}
-    with McapRecording(tmp_path / "live_2.mcap") as recording:
+    assert {file.name for file in tmp_path.glob("live*")} == {"live.mcap.part", "live_2.mcap", "live_3.mcap"}
+    with McapRecording(tmp_path / "live_3.mcap") as recording:
         assert len(list(recording)) == 40
 
 

@@ -18,14 +18,12 @@ import pytest
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
-from builtin_interfaces.msg import Time
-from drives import HALL, drive
+from drives import drive
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from lifecycle_msgs.msg import Transition
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from ros_harness import STATE_AFTER, Ros, stamped_after
+from ros_harness import STATE_AFTER, Ros, corrected_range, header_at, stamped_after
 from rosgraph_msgs.msg import Clock
-from std_msgs.msg import Header
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
 from uwb_mitigation.types.stamps import to_ns
@@ -43,10 +41,6 @@ STATES = {
 }
 NODES = ("driver", "mitigator", "locator")
 SIMULATED = ("source:=simulated", "simulated_rate:=100.0", "start_delay:=0.0")
-
-
-def stamp(time_ns: int) -> Time:
-    return Time(sec=time_ns // NS, nanosec=time_ns % NS)
 
 
 class Nav2Manager:
@@ -89,9 +83,8 @@ class Nav2Manager:
 
 def raw_range(tag: int, sequence: int, range_m: float, time_ns: int = 0) -> RangeCir:
     """Return a range without a CIR: the mitigator subtracts exactly the offset."""
-    message = RangeCir(header=Header(stamp=stamp(time_ns)), tag_id=tag, anchor_id=1, sequence=sequence)
-    message.range = range_m
-    return message
+    header = header_at(time_ns)
+    return RangeCir(header=header, tag_id=tag, anchor_id=1, sequence=sequence, range=range_m)
 
 
 def test_nav2_takes_all_nodes_of_one_process_up_and_down_twice(ros: Ros, anchors: Path):
@@ -155,13 +148,12 @@ def test_a_simulated_clock_that_jumps_neither_stops_positions_nor_mixes_their_ti
         def played(start_s: int = start_s, rounds: itertools.count = rounds) -> bool:
             """Publish a fifth of a second."""
             for tick in np.arange(8) + 8 * next(rounds):
-                clock.publish(Clock(clock=stamp(start_s * NS + int(tick) * NS // 40)))
-                for row in np.flatnonzero(ranges.stamp_ns * 40 // NS == tick):
-                    fields = {"tag_id": 7, "anchor_id": HALL.anchors[ranges.anchor[row]].id, "variance": 0.01}
-                    header = Header(stamp=stamp(start_s * NS + int(ranges.stamp_ns[row])))
-                    publisher.publish(
-                        RangeCorrected(header=header, range=float(ranges.range_m[row]), **fields)
-                    )
+                # The time stops at the last range: the locator predicts positions in gaps.
+                time_ns = min(int(tick) * NS // 40, int(ranges.stamp_ns[-1]))
+                clock.publish(Clock(clock=header_at(start_s * NS + time_ns).stamp))
+                for row in np.flatnonzero(ranges.stamp_ns * 40 // NS == tick).tolist():
+                    header = header_at(start_s * NS + int(ranges.stamp_ns[row]))
+                    publisher.publish(corrected_range(ranges, row, header))
             ros.spin_for(0.05)
             return any(to_ns(pose.header.stamp) == start_s * NS + int(ranges.stamp_ns[-1]) for pose in poses)
 

@@ -187,12 +187,16 @@ def test_signal_ends_the_driver_immediately_in_any_state(ros: Ros, link: Path, s
     """`test_unusable_port_is_logged_once` ends it without a board."""
     with board(link) as device:
         driver = drive(ros, link)
-        ros.diagnosis("driver", lambda s: True)
+        driver.wait_for_output("connected to board")
         if state == "flooding":
             device.flood(60)
         ros.spin_for(0.3)
+        lost = driver.output.count("disconnected")
         assert driver.signal(signal.SIGTERM) == 0, driver.output
         assert "Traceback" not in driver.output
+        assert state == "flooding" or driver.output.count("disconnected") == lost, (
+            "it has closed the port itself"
+        )
 
 
 def test_board_corrects_as_the_host_with_the_offsets_of_the_driver(ros: Ros, link: Path):

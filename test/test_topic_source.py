@@ -152,7 +152,7 @@ class Convert:
 def types(monkeypatch: pytest.MonkeyPatch) -> None:
     for package, names in {
         "gtec_msgs": ("Ranging", "UWBRanging", "PozyxRangingWithCir"),
-        "nlink_parser": ("LinktrackNodeframe3", "LinktrackTagframe0"),
+        "nlink_parser": ("LinktrackAnchorframe0", "LinktrackNodeframe3", "LinktrackTagframe0"),
     }.items():
         module = SimpleNamespace(**dict.fromkeys(names, SimpleNamespace))
         monkeypatch.setitem(sys.modules, package, module)
@@ -162,6 +162,9 @@ def types(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_linktrack_frames(types: None):
     tagframe = SimpleNamespace(id=5, dis_arr=np.array([1.5, 0, 2.5, 0, 0, 0, 0, 0], np.float32))
     assert Convert("nlink_tagframe0").take(tagframe) == [(5, 0, 1.5), (5, 2, 2.5)]
+    tags = [SimpleNamespace(id=number, dis_arr=tagframe.dis_arr) for number in (3, 4)]
+    pairs = [(3, 0, 1.5), (3, 2, 2.5), (4, 0, 1.5), (4, 2, 2.5)]
+    assert Convert("nlink_anchorframe0").take(SimpleNamespace(nodes=tags)) == pairs
     nodes = [SimpleNamespace(id=3, dis=4.25, rx_rssi=-80.0, fp_rssi=-82.0)]
     convert = Convert("nlink_nodeframe3")
     assert convert.take(SimpleNamespace(id=5, nodes=nodes)) == [(5, 3, 4.25)]

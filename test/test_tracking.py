@@ -25,6 +25,7 @@ from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.robust_update import CONSTANT_SD
 from uwb_mitigation.positioning.recorded_tracks import track_tag
+from uwb_mitigation.recordings.bag.odometry import read_odometry
 from uwb_mitigation.recordings.bag.pose_paths import read_truth
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.recordings.formats import open_recording
@@ -219,6 +220,8 @@ def test_odometry_adds_the_heading_to_tracks(robot_bag: Path, tmp_path: Path):
     quaternions = np.loadtxt(tum)[:, 4:]
     assert np.abs(quaternions[:, 2]).max() > 0.5
     np.testing.assert_allclose(np.linalg.norm(quaternions, axis=1), 1.0, atol=1e-5)
+    forward, left, _ = read_odometry(out, ODOMETRY).twist[250:].T
+    assert np.percentile(np.abs(left), 95) < 0.3 * np.median(forward), "in the axes of the robot"
     # The written truth contains the heading.
     (truth,) = read_truth(out).values()
     (recorded,) = read_truth(robot_bag).values()
