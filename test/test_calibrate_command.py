@@ -256,14 +256,21 @@ def test_correction_is_selected_only_if_it_improves_each_drive():
         assert select(parts, ["a", "b", "c"], "a") == chosen
 
 
-def test_correction_whose_live_position_is_not_clearly_better_than_the_baseline_is_not_selected():
-    """It would be refused, also if a simpler one helps."""
+@pytest.mark.parametrize(
+    ("range_m", "live_m", "refusal"),
+    [
+        (0.1, (0.9, 1.08), "the live position is not clearly better than with raw ranges"),
+        (0.297, (0.5, 0.5), "the ranges are not better than with raw ranges"),
+    ],
+)
+def test_correction_that_would_be_refused_is_not_selected_if_a_simpler_one_helps(range_m, live_m, refusal):
     block = np.arange(400) // 40
-    residual_m = {name: np.full(400, value) for name, value in (("raw", 0.3), ("a", 0.2), ("b", 0.1))}
-    live_m = {"raw": np.ones(400), "a": np.full(400, 0.99), "b": np.where(block % 2, 0.9, 1.08)}
-    errors = HeldOut(block, residual_m, live_m, True)
+    residual_m = {name: np.full(400, value) for name, value in (("raw", 0.3), ("a", 0.2), ("b", range_m))}
+    errors_m = {"raw": np.ones(400), "a": np.full(400, 0.99), "b": np.where(block % 2, *live_m)}
+    errors = HeldOut(block, residual_m, errors_m, True)
     assert errors.live_gain("b", "a").mean > -MAX_INCREASE
     assert select([errors], ["a", "b"], "raw") == "a"
+    assert (errors.refusal("a", "raw"), errors.refusal("b", "raw")) == ("", refusal)
 
 
 def test_localisation_needs_few_ranges(site):

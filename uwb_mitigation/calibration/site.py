@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,11 +11,11 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.calibration.held_out import (
     BLOCK_S,
-    MIN_GAIN,
     PROMISED_SHARE,
     RAW,
     HeldOut,
     decisive,
+    ranges_text,
     select,
 )
 from uwb_mitigation.calibration.site_data import SiteData, read_site
@@ -163,27 +162,18 @@ class SiteCalibration:
         """Return why the calibration does not help; empty: it does."""
         for errors in self.held_out:
             drive = "on the drive of the check " if errors is not self.held_out[0] else ""
-            least_gain = errors.live_gain(self.chosen, self.baseline).low
-            if self.solution.truth is not None and math.isnan(least_gain):
-                return f"{drive}there are too few live positions to compare"
-            if least_gain <= 0.0:
-                return f"{drive}the live position is not clearly better than with {self._baseline_text}"
-            if not errors.range_gain(self.chosen, self.baseline).mean >= MIN_GAIN:
-                return f"{drive}the ranges are not better than with {self._baseline_text}"
+            if reason := errors.refusal(self.chosen, self.baseline):
+                return drive + reason
         is_raw = self.solution.truth is None and self.baseline == RAW
         if is_raw and not self.live_position_change <= -MIN_PROMISE:
             reason = self.solution.offsets_refused or "are not clearly better"
             return f"the locator estimates the common offset itself, and offsets of single anchors {reason}"
         return ""
 
-    @property
-    def _baseline_text(self) -> str:
-        return "raw ranges" if self.baseline == RAW else f"the {SHIPPED}"
-
     def summary(self) -> str:
         """Return the result in a sentence."""
         change = self.live_position_change
-        text = f"Compared with {self._baseline_text}, the live position error on another drive "
+        text = f"Compared with {ranges_text(self.baseline)}, the live position error on another drive "
         text += f"decreases by at least {-change:.0%}." if change < 0.0 else "is not expected to change."
         return f"Calibration does not help: {self.refusal}. {text}" if self.refusal else text
 
