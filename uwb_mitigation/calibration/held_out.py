@@ -149,7 +149,8 @@ def select(error_sets: Sequence[HeldOut], names: Sequence[str], baseline: str) -
 
     A more complex correction must improve significantly on each separate drive, and without any on the halves of the drive; the
     other parts must not become worse. With ground truth it must reduce the live position error, or the range error without
-    increasing the former: better ranges do not always give better positions. `HeldOut.refusal` must accept it on every part.
+    increasing the former: better ranges do not always give better positions. `HeldOut.refusal` must accept it on
+    every part, if it accepts any.
 
     Args:
         error_sets: errors of each drive, or of its halves.
@@ -159,8 +160,6 @@ def select(error_sets: Sequence[HeldOut], names: Sequence[str], baseline: str) -
     decisive_sets = decisive(error_sets)
 
     def improves(errors: HeldOut, name: str, base: str) -> bool:
-        if errors.refusal(name, baseline):
-            return False
         gain, live = errors.range_gain(name, base), errors.live_gain(name, base)
         if errors not in decisive_sets:
             return gain.mean > 0.0
@@ -168,8 +167,10 @@ def select(error_sets: Sequence[HeldOut], names: Sequence[str], baseline: str) -
             return gain.is_significant
         return live.is_significant or (gain.is_significant and live.mean > -MAX_INCREASE)
 
+    helpful = [name for name in names if not any(errors.refusal(name, baseline) for errors in error_sets)]
     best = names[0]
-    for name in names[1:]:
+    # If none helps, the best one is written on request.
+    for name in helpful or names:
         if all(improves(errors, name, best) for errors in error_sets):
             best = name
     return best
