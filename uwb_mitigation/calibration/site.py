@@ -85,11 +85,13 @@ class SiteModel:
     def correction_m(self, site: SiteData) -> NDArray[np.float64]:
         """Return the predicted errors of all ranges, float64 (r,), m; 0 where a power that the line needs is unknown."""
         if self.has_network:
-            return site.universal_m
+            return site.table["universal_m"]
         line = self.linear_bias
         # Without a power gap, the first-path power is not needed.
-        first_path_dbm = site.first_path_power_dbm if line.per_power_gap else site.rx_power_dbm
-        predicted_m = line.predict_m(site.rx_power_dbm, first_path_dbm).astype(np.float64)
+        first_path_dbm = (
+            site.table["first_path_power_dbm"] if line.per_power_gap else site.table["rx_power_dbm"]
+        )
+        predicted_m = line.predict_m(site.table["rx_power_dbm"], first_path_dbm).astype(np.float64)
         return np.where(np.isfinite(predicted_m), predicted_m, 0.0)
 
 
@@ -326,7 +328,7 @@ def calibrate_site(
     corrections = {RAW: (NONE, NO_MODEL)}
     if site.has_cirs:
         corrections[SHIPPED] = NONE, NETWORK
-        if without_cir := int((~site.is_usable).sum()):
+        if without_cir := int((~site.table["is_usable"]).sum()):
             notes.append(f"{without_cir} ranges without a usable CIR are only used for track and offsets")
     else:
         notes.append("no networks: the recording has no CIRs that the universal model was trained for")
@@ -373,7 +375,7 @@ class _Fold:
         residual_m, live_m = dict[str, NDArray[np.float64]](), dict[str, NDArray[np.float64]]()
         for name, (level, kind) in corrections.items():
             model = _fit(kind, training_site, solution, level)
-            predicted_m = np.where(site.is_usable, model.correction_m(site), 0.0)
+            predicted_m = np.where(site.table["is_usable"], model.correction_m(site), 0.0)
             range_m = site.ranges.range_m - predicted_m
             offsets = solution.offsets(level)
             corrected_m = np.maximum(range_m - _offsets_m(site, offsets), 0.0)
