@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -320,10 +321,6 @@ def calibrate_site(
         solved = [solution.solve_part(half) for half in halves]
     except DatasetError as error:
         raise DatasetError(f"a half of the drive: {error}", valid="a longer drive") from error
-    first, second = zip(halves, solved, strict=True)
-    folds = _Fold(*first, second), _Fold(*second, first)
-    checks = [_Fold(drive, solution.solve_part(drive), (site, solution)) for drive in check]
-
     notes = list(solution.notes)
     corrections = {RAW: (NONE, NO_MODEL)}
     if site.has_cirs:
@@ -335,10 +332,13 @@ def calibrate_site(
     baseline = list(corrections)[-1]
     candidates = {_name(level, kind): (level, kind) for level, kind in _candidates(site, solution)}
     corrections |= candidates
-    first_half, second_half = (
-        fold.evaluate(universal, corrections, is_separate=is_separate) for fold in folds
+    evaluate = functools.partial(_held_out, universal, corrections)
+    first, second = zip(halves, solved, strict=True)
+    first_half = evaluate(*first, second, is_separate=is_separate)
+    second_half = evaluate(*second, first, is_separate=is_separate)
+    drives = (
+        evaluate(drive, solution.solve_part(drive), (site, solution), is_separate=True) for drive in check
     )
-    drives = (fold.evaluate(universal, corrections, is_separate=True) for fold in checks)
     held_out = [first_half.merged(second_half, is_first), *drives]
     chosen = select(held_out, list(candidates), baseline)
     level, kind = candidates[chosen]
@@ -354,71 +354,66 @@ def calibrate_site(
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Fold:
-    """Ranges of a test and their reference, and what the corrections are fitted to."""
+def _held_out(
+    universal: Bundle,
+    corrections: Mapping[str, tuple[str, str]],
+    site: SiteData,
+    reference: SiteSolution,
+    training: tuple[SiteData, SiteSolution],
+    *,
+    is_separate: bool,
+) -> HeldOut:
+    """Return the errors of corrections, {name: (level of the offsets, kind of the model)}, that were fitted to other data."""
+    training_site, solution = training
+    block = site.ranges.stamp_ns // round(BLOCK_S * NS_PER_S)
+    residual_m, live_m = dict[str, NDArray[np.float64]](), dict[str, NDArray[np.float64]]()
+    for name, (level, kind) in corrections.items():
+        model = _fit(kind, training_site, solution, level)
+        predicted_m = np.where(site.table["is_usable"], model.correction_m(site), 0.0)
+        range_m = site.ranges.range_m - predicted_m
+        offsets = solution.offsets(level)
+        corrected_m = np.maximum(range_m - _offsets_m(site, offsets), 0.0)
+        # Without ground truth the track of the reference contains no common offset, because the locator estimates it.
+        remaining_m = solution.common_m - offsets.default if solution.truth is None else 0.0
+        residual_m[name] = reference.errors_of(corrected_m - remaining_m) + remaining_m
+        if solution.truth is not None:
+            # The locator does not use the variance of ranges that no model corrected.
+            variance_m2 = np.full(len(range_m), np.nan)
+            if model.has_network:
+                unscored = np.zeros(len(range_m), np.float32)
+                rule = CorrectionRule(universal.card)
+                variance_m2 = rule.apply(predicted_m.astype(np.float32), unscored)[1].astype(np.float64)
+            elif model.is_line:
+                intervals = fit_intervals(residual_m[name], predicted_m, block.astype(str))
+                variance_m2 = intervals.variance_of(predicted_m)
+            live_m[name] = _live_errors_m(site, reference, corrected_m, variance_m2)
+    return HeldOut(block, residual_m, live_m, is_separate)
 
-    site: SiteData
-    reference: SiteSolution
-    training: tuple[SiteData, SiteSolution]
 
-    def evaluate(
-        self,
-        universal: Bundle,
-        corrections: Mapping[str, tuple[str, str]],
-        *,
-        is_separate: bool,
-    ) -> HeldOut:
-        """Return the errors of corrections, {name: (level of the offsets, kind of the model)}."""
-        site, (training_site, solution) = self.site, self.training
-        block = site.ranges.stamp_ns // round(BLOCK_S * NS_PER_S)
-        residual_m, live_m = dict[str, NDArray[np.float64]](), dict[str, NDArray[np.float64]]()
-        for name, (level, kind) in corrections.items():
-            model = _fit(kind, training_site, solution, level)
-            predicted_m = np.where(site.table["is_usable"], model.correction_m(site), 0.0)
-            range_m = site.ranges.range_m - predicted_m
-            offsets = solution.offsets(level)
-            corrected_m = np.maximum(range_m - _offsets_m(site, offsets), 0.0)
-            # Without ground truth the track of the reference contains no common offset, because the locator estimates it.
-            remaining_m = solution.common_m - offsets.default if solution.truth is None else 0.0
-            residual_m[name] = self.reference.errors_of(corrected_m - remaining_m) + remaining_m
-            if solution.truth is not None:
-                # The locator does not use the variance of ranges that no model corrected.
-                variance_m2 = np.full(len(range_m), np.nan)
-                if model.has_network:
-                    unscored = np.zeros(len(range_m), np.float32)
-                    rule = CorrectionRule(universal.card)
-                    variance_m2 = rule.apply(predicted_m.astype(np.float32), unscored)[1].astype(np.float64)
-                elif model.is_line:
-                    intervals = fit_intervals(residual_m[name], predicted_m, block.astype(str))
-                    variance_m2 = intervals.variance_of(predicted_m)
-                live_m[name] = self._live_errors_m(corrected_m, variance_m2)
-        return HeldOut(block, residual_m, live_m, is_separate)
-
-    def _live_errors_m(
-        self, range_m: NDArray[np.float64], variance_m2: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Return the error of the live position at each range, (r,), m; NaN: no position, or no reference."""
-        site, height = self.site, self.reference.height
-        corrected = replace(
-            site.ranges, range_m=range_m, variance_m2=variance_m2, is_corrected=np.isfinite(variance_m2)
-        )
-        error_m = np.full(len(range_m), np.nan)
-        axes = slice(0, 3 if height is None and site.height_m is None else 2)
-        for number in range(len(site.tags)):
-            rows = np.flatnonzero(site.tag == number)
-            ranges, heights = corrected.take(rows), None
-            if site.height_m is not None:
-                heights = Heights(ranges.stamp_ns, site.height_m[rows], np.full(len(rows), HEIGHT_SD_M**2))
-            config = EstimatorConfig(site.anchors, height=height, heights=heights)
-            track = TagEstimator(config).run(ranges)
-            if not len(track):
-                continue
-            index = np.searchsorted(track.stamp_ns, ranges.stamp_ns, side="right").clip(1) - 1
-            difference = track.position[index] - self.reference.antenna_position[rows]
-            has_position = track.stamp_ns[index] == ranges.stamp_ns
-            error_m[rows[has_position]] = np.linalg.norm(difference[has_position, axes], axis=1)
-        return error_m
+def _live_errors_m(
+    site: SiteData, reference: SiteSolution, range_m: NDArray[np.float64], variance_m2: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the error of the live position at each range, (r,), m; NaN: no position, or no reference."""
+    height = reference.height
+    corrected = replace(
+        site.ranges, range_m=range_m, variance_m2=variance_m2, is_corrected=np.isfinite(variance_m2)
+    )
+    error_m = np.full(len(range_m), np.nan)
+    axes = slice(0, 3 if height is None and site.height_m is None else 2)
+    for number in range(len(site.tags)):
+        rows = np.flatnonzero(site.tag == number)
+        ranges, heights = corrected.take(rows), None
+        if site.height_m is not None:
+            heights = Heights(ranges.stamp_ns, site.height_m[rows], np.full(len(rows), HEIGHT_SD_M**2))
+        config = EstimatorConfig(site.anchors, height=height, heights=heights)
+        track = TagEstimator(config).run(ranges)
+        if not len(track):
+            continue
+        index = np.searchsorted(track.stamp_ns, ranges.stamp_ns, side="right").clip(1) - 1
+        difference = track.position[index] - reference.antenna_position[rows]
+        has_position = track.stamp_ns[index] == ranges.stamp_ns
+        error_m[rows[has_position]] = np.linalg.norm(difference[has_position, axes], axis=1)
+    return error_m
 
 
 def _candidates(site: SiteData, solution: SiteSolution) -> list[tuple[str, str]]:
