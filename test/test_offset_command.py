@@ -48,12 +48,6 @@ def longer(records: list[Record], by_m: float) -> Iterator[Record]:
         yield changed(record, range_m=record.measurement.range_m + by_m)
 
 
-def weaker_first_path(records: list[Record], by_db: float) -> Iterator[Record]:
-    for record in records:
-        level_dbm = record.measurement.cir.first_path_power_dbm - by_db
-        yield changed(record, {"first_path_power_dbm": level_dbm})
-
-
 def without_levels(records: list[Record]) -> Iterator[Record]:
     """Return the records without preamble counts and levels."""
     unknown = {"rx_power_dbm": float("nan"), "first_path_power_dbm": float("nan")}
@@ -94,8 +88,9 @@ def test_without_levels_los_is_detected_in_the_cir(direct: list[Record]):
 
 
 def test_nlos_is_refused_with_the_evidence(universal: Mitigation, direct: list[Record]):
+    levels = [{"first_path_power_dbm": one.measurement.cir.first_path_power_dbm - 9.0} for one in direct]
     with pytest.raises(DatasetError, match=r"not line of sight: the first path is \d+\.\d dB below"):
-        estimate_offset(universal, weaker_first_path(direct, 9.0), 3.0)
+        estimate_offset(universal, map(changed, direct, levels), 3.0)
     with pytest.raises(DatasetError, match="check the distance"):
         estimate_offset(universal, longer(direct, 20.0), 3.0)
     with pytest.raises(DatasetError, match="only 5 ranges are in line of sight"):

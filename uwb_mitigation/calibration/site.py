@@ -73,19 +73,14 @@ SHIPPED = "shipped model alone"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SiteModel:
-    """A linear bias model, or if it `has_network` the universal network."""
+    """A model of the kind `NO_MODEL`, `LINE` or `NETWORK`, and the linear bias of its model card."""
 
+    kind: str
     linear_bias: LinearBiasModel
-    has_network: bool = False
-
-    @property
-    def is_line(self) -> bool:
-        """Whether it is a line in the received power."""
-        return self.linear_bias.needs_power
 
     def correction_m(self, site: SiteData) -> NDArray[np.float64]:
         """Return the predicted errors of all ranges, float64 (r,), m; 0 where a power that the line needs is unknown."""
-        if self.has_network:
+        if self.kind == NETWORK:
             return site.table["universal_m"]
         line = self.linear_bias
         # Without a power gap, the first-path power is not needed.
@@ -227,7 +222,7 @@ class SiteCalibration:
             "measurements": len(self.solution.rows),
             "split": "held out: halves of the drive",
             "started_from": f"{universal.model_id:08x}",
-            "recipe": {"line": model.linear_bias.needs_power, "network": model.has_network},
+            "recipe": {"line": model.kind == LINE, "network": model.kind == NETWORK},
             "metrics_m": {row: {"mae": round(value, 4)} for row, value in self.mae_m.items()},
         }
         card = replace(
@@ -237,7 +232,7 @@ class SiteCalibration:
             training=training,
         )
         network = universal.model
-        if model.is_line:
+        if model.kind == LINE:
             network = graph.float_model(scaled(float_network(universal), 0.0))
             data = _labelled(self.site, self.solution, self.level)
             fitted = output.stem, universal.architecture, data, model.linear_bias
@@ -379,11 +374,11 @@ def _held_out(
         if solution.truth is not None:
             # The locator does not use the variance of ranges that no model corrected.
             variance_m2 = np.full(len(range_m), np.nan)
-            if model.has_network:
+            if model.kind == NETWORK:
                 unscored = np.zeros(len(range_m), np.float32)
                 rule = CorrectionRule(universal.card)
                 variance_m2 = rule.apply(predicted_m.astype(np.float32), unscored)[1].astype(np.float64)
-            elif model.is_line:
+            elif model.kind == LINE:
                 intervals = fit_intervals(residual_m[name], predicted_m, block.astype(str))
                 variance_m2 = intervals.variance_of(predicted_m)
             live_m[name] = _live_errors_m(site, reference, corrected_m, variance_m2)
@@ -462,11 +457,12 @@ def _offsets_m(site: SiteData, offsets: Offsets) -> NDArray[np.float64]:
 def _fit(kind: str, site: SiteData, solution: SiteSolution, level: str) -> SiteModel:
     """Return a model of this kind for ranges with the offsets subtracted."""
     if kind != LINE:
-        return SiteModel(LinearBiasModel(0.0), has_network=kind == NETWORK)
+        return SiteModel(kind, LinearBiasModel(0.0))
     data = _labelled(site, solution, level)
     has_gap = bool(np.isfinite(data.rx_power_dbm - data.first_path_power_dbm).mean() > 0.5)
     first_path_dbm = data.first_path_power_dbm if has_gap else None
-    return SiteModel(fit_linear_bias(data.configurations, data.rx_power_dbm, first_path_dbm, data.error_m))
+    line = fit_linear_bias(data.configurations, data.rx_power_dbm, first_path_dbm, data.error_m)
+    return SiteModel(LINE, line)
 
 
 def _labelled(site: SiteData, solution: SiteSolution, level: str) -> Dataset:
