@@ -11,7 +11,6 @@ import pytest
 from bag_material import write_records
 from command_line import run, succeed
 from drives import HALL, circuit, drive
-from rosbags.typesys import Stores, get_typestore
 
 from uwb_mitigation.calibration import solution as solution_module
 from uwb_mitigation.calibration.held_out import MAX_INCREASE, HeldOut, select
@@ -31,11 +30,11 @@ from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.anchors import Anchor, AnchorMap, save_anchors
 from uwb_mitigation.types.measurement import Cir, RadioType, RangeMeasurement, Record, Segment, Status
 from uwb_mitigation.types.offsets import read_offsets
-from uwb_mitigation.types.ros.poses import encode_odometry
+from uwb_mitigation.types.ros.poses import Fields, encode_odometry, header_fields, quaternion, vector
+from uwb_mitigation.types.ros.schemas import serialize
 from uwb_mitigation.types.ros.topics import TF_TYPE
 from uwb_mitigation.types.tracks import Estimate, Heading, PosePath, TruePath
 
-STORE = get_typestore(Stores.ROS2_JAZZY)
 UNIVERSAL = load_bundle(default_model_path())
 SITE = AnchorMap([*HALL.anchors, Anchor(6, (6.0, 9.0, 1.5), 0.01), Anchor(7, (0.0, 4.5, 1.5), 0.01)])
 OWN = np.array([0.4, 0.0, 0.35, -0.05, 0.25, 0.05, 0.15])
@@ -44,11 +43,9 @@ LEVER = np.array([0.4, 0.1, 0.0])
 
 def arm_to(frame):
     """Return a TFMessage in CDR: a frame at `LEVER` in base_link."""
-    of = STORE.types
-    header = of["std_msgs/msg/Header"](of["builtin_interfaces/msg/Time"](0, 0), "base_link")
-    at = of["geometry_msgs/msg/Vector3"](*LEVER), of["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
-    step = of["geometry_msgs/msg/TransformStamped"](header, frame, of["geometry_msgs/msg/Transform"](*at))
-    return bytes(STORE.serialize_cdr(of[TF_TYPE]([step]), TF_TYPE))
+    transform = Fields(translation=vector(*LEVER), rotation=quaternion(0.0))
+    link = Fields(header=header_fields(0, "base_link"), child_frame_id=frame, transform=transform)
+    return serialize(TF_TYPE, transforms=[link])
 
 
 def with_errors(ranges, seed):

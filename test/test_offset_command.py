@@ -32,15 +32,16 @@ def universal() -> Mitigation:
     return Mitigation(load_bundle(default_model_path()))
 
 
+def labelled(label: str) -> list[Record]:
+    """Return simulated ranges with their truth."""
+    source = SimulatedSource(seed=11, count=1500)
+    return [record for record in source if record.truth is not None and record.truth.label == label]
+
+
 @pytest.fixture(scope="module")
 def direct() -> list[Record]:
-    """Return simulated LOS ranges of one pair with their truth."""
-    seen = [
-        record
-        for record in SimulatedSource(seed=11, count=1500)
-        if record.truth is not None and record.truth.label == "LOS"
-    ]
-    return [changed(record, tag_id=1, anchor_id=2) for record in seen]
+    """Return ranges of one pair in LOS."""
+    return [changed(record, tag_id=1, anchor_id=2) for record in labelled("LOS")]
 
 
 def longer(records: list[Record], by_m: float) -> Iterator[Record]:
@@ -78,13 +79,8 @@ def test_without_levels_los_is_detected_in_the_cir(direct: list[Record]):
     gaps = {one.placement: one.power_gap_db for one in reported.placements}
     for one in found.placements:
         assert one.power_gap_db == pytest.approx(gaps[one.placement], abs=1.0)
-    blocked = [
-        record
-        for record in SimulatedSource(seed=11, count=1500)
-        if record.truth is not None and record.truth.label == "NDP NLOS"
-    ]
     with pytest.raises(DatasetError, match="not line of sight"):
-        estimate_offset(amplitude, without_levels(blocked[:1] * 20))
+        estimate_offset(amplitude, without_levels(labelled("NDP NLOS")[:1] * 20))
 
 
 def test_nlos_is_refused_with_the_evidence(universal: Mitigation, direct: list[Record]):
