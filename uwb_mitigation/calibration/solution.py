@@ -41,8 +41,8 @@ without many obstacles, 1.41 or more in 16 of 20 sites with walls (seeds 103 to 
 MIN_DISPLACEMENT_SD_M = 0.05
 """Offsets of single anchors are not used if a displacement of the whole track explains less of them than its standard deviation, if
 that is larger than this. In a simulated room (`box` in 3-D, seed 347), offsets of two opposite pairs of corners were wrong by 0.06 to
-0.15 m, together, and the live error of another drive increased by 9 %. Seen on rings of anchors: 0.03 m. The limit is cautious: in 12
-drives in similar rooms (seeds 400 to 404), offsets that it accepts reduced the live error by 13 to 46 %, but those that it refuses by 7 to
+0.15 m, together, and the live error of another drive increased by 9 %. Seen on rings of anchors: 0.03 m. The limit is cautious: in 15
+drives in similar rooms (seeds 400 to 407), offsets that it accepts reduced the live error by 13 to 56 %, but those that it refuses by 7 to
 49 %, too."""
 
 SUBTRACTED_SHARE = 0.5
