@@ -10,12 +10,13 @@ import pytest
 from benchmarks.equipment.board import Board
 from uwb_mitigation.radios.settings import PortMessage, RadioSettings
 from uwb_mitigation.radios.wire import messages
-from uwb_mitigation.radios.wire.events import Event, LinkState, Loss
+from uwb_mitigation.radios.wire.events import Event, LinkState, Loss, Refused
 from uwb_mitigation.radios.wire.framing import FrameDecoder, FrameEncoder, WireFrame, encode_frame
-from uwb_mitigation.radios.wire.layout import Flag, LogLevel, MessageType, Mode
+from uwb_mitigation.radios.wire.layout import MAX_OFFSETS, Flag, LogLevel, MessageType, Mode
 from uwb_mitigation.radios.wire.messages import BoardStatus, Correction, Hello, Log
 from uwb_mitigation.radios.wire.session import BoardSession
 from uwb_mitigation.types.measurement import Cir, CorrectedBy, CorrectedRange, RangeMeasurement, Status
+from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets
 
 MS = 10**6
 EPOCH = 1_760_000_000 * 10**9
@@ -312,3 +313,68 @@ def test_clock_is_synchronised_quickly_and_then_every_second():
 
     assert bench.session.clock.synchronised
     assert 8 + 8 <= requests <= 8 + 14
+
+
+class OffsetsOnly:
+    """Corrects only the offset."""
+
+    offsets = Offsets(9.0)
+
+    def correct(self, measurements: list[RangeMeasurement]) -> list[CorrectedRange]:
+        offset_m = [float(self.offsets.lookup([m.tag_id], [m.anchor_id])[0]) for m in measurements]
+        source = Status.OK, CorrectedBy.DEVICE, IDENTITY.model_id
+        pairs = zip(measurements, offset_m, strict=True)
+        return [CorrectedRange(m.range_m - by_m, m.range_m, by_m, 1.0, *source) for m, by_m in pairs]
+
+
+class OlderBoard(Board):
+    """A board whose firmware ignores offsets."""
+
+    def _answer(self, frame: WireFrame, now_us: int) -> bytes:
+        return b"" if frame.type == MessageType.SET_OFFSETS else super()._answer(frame, now_us)
+
+
+def with_offsets(offsets: Offsets, board: type[Board] = Board) -> Bench:
+    bench = Bench(BoardSession())
+    bench.board = board(IDENTITY, OffsetsOnly(), mode=Mode.DEVICE)
+    bench.host_hears(bench.board.hello(0))
+    bench.session.set_offsets(offsets)
+    return bench
+
+
+def ranges_m(bench: Bench) -> list[float]:
+    return [event.corrected.range_m for event in bench.measure(1) if isinstance(event, Correction)]
+
+
+def test_board_subtracts_the_offsets_of_the_host_also_after_a_restart():
+    bench = with_offsets(Offsets(0.25))
+    assert ranges_m(bench) == []
+    assert bench.session.counts["wrong_offsets"] == 1
+    bench.run(1000)
+    assert ranges_m(bench) == [3.75]
+    bench.booted, bench.board = bench.now, Board(IDENTITY, OffsetsOnly(), mode=Mode.DEVICE, boot_id=2)
+    bench.host_hears(bench.board.hello(0))
+    assert ranges_m(bench) == []
+    bench.run(1000)
+    assert ranges_m(bench) == [3.75]
+    bench.session.set_offsets(NO_OFFSETS)
+    bench.run(1000)
+    assert ranges_m(bench) == [4.0]
+    assert bench.received(Refused) == []
+
+
+@pytest.mark.parametrize(("offsets", "refusals", "ranges"), [(Offsets(0.25), 1, []), (NO_OFFSETS, 0, [4.0])])
+def test_older_board_is_accepted_only_without_offsets(offsets: Offsets, refusals: int, ranges: list[float]):
+    bench = with_offsets(offsets, OlderBoard)
+    bench.run(20_000)
+    texts = [event.text for event in bench.received(Refused)]
+    assert ["flash a newer" in text for text in texts] == [True] * refusals
+    assert ranges_m(bench) == ranges
+
+
+def test_too_many_offsets_for_a_board_are_refused_with_both_numbers():
+    bench = with_offsets(Offsets(anchors=dict.fromkeys(range(MAX_OFFSETS + 1), 0.1)))
+    bench.run(1000)
+    (refused,) = bench.received(Refused)
+    assert f"can store {MAX_OFFSETS} offsets, but {MAX_OFFSETS + 1}" in refused.text
+    assert ranges_m(bench) == []

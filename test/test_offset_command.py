@@ -32,26 +32,21 @@ def universal() -> Mitigation:
     return Mitigation(load_bundle(default_model_path()))
 
 
+def labelled(label: str) -> list[Record]:
+    """Return simulated ranges with their truth."""
+    source = SimulatedSource(seed=11, count=1500)
+    return [record for record in source if record.truth is not None and record.truth.label == label]
+
+
 @pytest.fixture(scope="module")
 def direct() -> list[Record]:
-    """Return simulated LOS ranges of one pair with their truth."""
-    seen = [
-        record
-        for record in SimulatedSource(seed=11, count=1500)
-        if record.truth is not None and record.truth.label == "LOS"
-    ]
-    return [changed(record, tag_id=1, anchor_id=2) for record in seen]
+    """Return ranges of one pair in LOS."""
+    return [changed(record, tag_id=1, anchor_id=2) for record in labelled("LOS")]
 
 
 def longer(records: list[Record], by_m: float) -> Iterator[Record]:
     for record in records:
         yield changed(record, range_m=record.measurement.range_m + by_m)
-
-
-def weaker_first_path(records: list[Record], by_db: float) -> Iterator[Record]:
-    for record in records:
-        level_dbm = record.measurement.cir.first_path_power_dbm - by_db
-        yield changed(record, {"first_path_power_dbm": level_dbm})
 
 
 def without_levels(records: list[Record]) -> Iterator[Record]:
@@ -84,18 +79,14 @@ def test_without_levels_los_is_detected_in_the_cir(direct: list[Record]):
     gaps = {one.placement: one.power_gap_db for one in reported.placements}
     for one in found.placements:
         assert one.power_gap_db == pytest.approx(gaps[one.placement], abs=1.0)
-    blocked = [
-        record
-        for record in SimulatedSource(seed=11, count=1500)
-        if record.truth is not None and record.truth.label == "NDP NLOS"
-    ]
     with pytest.raises(DatasetError, match="not line of sight"):
-        estimate_offset(amplitude, without_levels(blocked[:1] * 20))
+        estimate_offset(amplitude, without_levels(labelled("NDP NLOS")[:1] * 20))
 
 
 def test_nlos_is_refused_with_the_evidence(universal: Mitigation, direct: list[Record]):
+    levels = [{"first_path_power_dbm": one.measurement.cir.first_path_power_dbm - 9.0} for one in direct]
     with pytest.raises(DatasetError, match=r"not line of sight: the first path is \d+\.\d dB below"):
-        estimate_offset(universal, weaker_first_path(direct, 9.0), 3.0)
+        estimate_offset(universal, map(changed, direct, levels), 3.0)
     with pytest.raises(DatasetError, match="check the distance"):
         estimate_offset(universal, longer(direct, 20.0), 3.0)
     with pytest.raises(DatasetError, match="only 5 ranges are in line of sight"):

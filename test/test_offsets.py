@@ -1,4 +1,4 @@
-"""Offsets of radios: file, precedence, effect on a range, and transfer to a board."""
+"""Offsets of radios: file, precedence and effect on a range."""
 
 from __future__ import annotations
 
@@ -10,16 +10,10 @@ import numpy as np
 import pytest
 from model_material import bundle, measurement
 
-from benchmarks.equipment.board import Board
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.architecture import Remnet
-from uwb_mitigation.radios.wire.events import Refused
-from uwb_mitigation.radios.wire.framing import WireFrame
-from uwb_mitigation.radios.wire.layout import MAX_OFFSETS, MessageType, Mode
-from uwb_mitigation.radios.wire.messages import Correction, Hello
-from uwb_mitigation.radios.wire.session import MAX_TRIES, REQUEST_INTERVAL_NS, BoardSession
-from uwb_mitigation.types.measurement import CorrectedBy, CorrectedRange, RangeMeasurement, Status
+from uwb_mitigation.types.measurement import Status
 from uwb_mitigation.types.offsets import (
     MAX_ENTRIES,
     MAX_OFFSET_M,
@@ -160,87 +154,3 @@ def test_passed_through_range_has_the_offset_subtracted(
     assert result.correction_m == offset
     assert str(result.range_raw_m) == str(range_m)
     assert math.isfinite(result.variance_m2) is valid
-
-
-class Echo:
-    """Corrects only the offset."""
-
-    def __init__(self) -> None:
-        self.offsets = Offsets(9.0)
-
-    def correct(self, measurements: list[RangeMeasurement]) -> list[CorrectedRange]:
-        (asked,) = measurements
-        offset_m = float(self.offsets.lookup([asked.tag_id], [asked.anchor_id])[0])
-        range_m = asked.range_m
-        return [CorrectedRange(range_m - offset_m, range_m, offset_m, 1.0, Status.OK, CorrectedBy.DEVICE, 5)]
-
-
-class OlderBoard(Board):
-    """A board whose firmware ignores offsets."""
-
-    def _answer(self, frame: WireFrame, now_us: int) -> bytes:
-        return b"" if frame.type == MessageType.SET_OFFSETS else super()._answer(frame, now_us)
-
-
-class Pair:
-    """A session connected to a board."""
-
-    def __init__(self, offsets: Offsets, board: type[Board] = Board) -> None:
-        self.session = BoardSession()
-        self.board_class = board
-        self.now = 0
-        self.events: list[object] = []
-        self.start()
-        self.session.set_offsets(offsets)
-
-    def start(self, boot: int = 1) -> None:
-        self.board = self.board_class(Hello(model_id=5), Echo(), mode=Mode.DEVICE, boot_id=boot)
-        self.deliver(self.board.hello(self.now))
-
-    def deliver(self, data: bytes) -> None:
-        self.events += self.session.receive(data, self.now, self.now)
-
-    def turn(self) -> None:
-        self.now += REQUEST_INTERVAL_NS
-        self.deliver(b"")
-        self.deliver(self.board.receive(self.session.outgoing(), self.now // 1000))
-
-    def range(self) -> list[float]:
-        before = len(self.events)
-        self.deliver(self.board.measure(measurement(3.0), self.now // 1000))
-        return [event.corrected.range_m for event in self.events[before:] if isinstance(event, Correction)]
-
-
-def test_board_subtracts_the_offsets_of_the_host_also_after_a_restart():
-    pair = Pair(Offsets(0.25))
-    assert pair.range() == []
-    assert pair.session.counts["wrong_offsets"] == 1
-    pair.turn()
-    assert pair.range() == [2.75]
-    pair.start(boot=2)
-    assert pair.range() == []
-    pair.turn()
-    assert pair.range() == [2.75]
-    pair.session.set_offsets(NO_OFFSETS)
-    pair.turn()
-    assert pair.range() == [3.0]
-    assert not [event for event in pair.events if isinstance(event, Refused)]
-
-
-@pytest.mark.parametrize(("offsets", "refusals", "ranges"), [(Offsets(0.25), 1, []), (NO_OFFSETS, 0, [3.0])])
-def test_older_board_is_accepted_only_without_offsets(offsets: Offsets, refusals: int, ranges: list[float]):
-    pair = Pair(offsets, OlderBoard)
-    for _ in range(MAX_TRIES + 3):
-        pair.turn()
-    refused = [event for event in pair.events if isinstance(event, Refused)]
-    assert len(refused) == refusals
-    assert all("flash a newer" in event.text for event in refused)
-    assert pair.range() == ranges
-
-
-def test_too_many_offsets_for_a_board_are_refused_with_both_numbers():
-    pair = Pair(Offsets(anchors=dict.fromkeys(range(MAX_OFFSETS + 1), 0.1)))
-    pair.turn()
-    (refused,) = [event for event in pair.events if isinstance(event, Refused)]
-    assert f"can store {MAX_OFFSETS} offsets, but {MAX_OFFSETS + 1}" in refused.text
-    assert pair.range() == []

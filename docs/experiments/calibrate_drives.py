@@ -12,6 +12,7 @@ have CIRs, otherwise raw. Seeds below 200, from 700 on, and those that the code 
 
     PYTHONPATH=. python docs/experiments/calibrate_drives.py cirs bare flat geometry --first 200 --seeds 2
     PYTHONPATH=. python docs/experiments/calibrate_drives.py levels hanyang --check -o drives.jsonl
+    PYTHONPATH=. python docs/experiments/calibrate_drives.py geometry --only 'ceiling|corridor|outdoor' --first 380 --seeds 8
     PYTHONPATH=. python docs/experiments/calibrate_drives.py cirs levels --truth --first 200 --seeds 2
 """
 
@@ -20,6 +21,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
+import re
 import tempfile
 import time
 from collections import defaultdict
@@ -224,6 +226,7 @@ def main() -> None:
     parser.add_argument("kinds", nargs="+", metavar="SET")
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--only", default="", metavar="PATTERN", help="only cases with such names")
     choice = parser.add_mutually_exclusive_group()
     choice.add_argument("--check", action="store_true")
     choice.add_argument("--truth", action="store_true")
@@ -235,6 +238,8 @@ def main() -> None:
     for case in cases(
         arguments.kinds, range(arguments.first, arguments.first + arguments.seeds), arguments.data
     ):
+        if not re.search(arguments.only, case.name):
+            continue
         row = evaluate(case, has_check=arguments.check, has_truth=arguments.truth)
         show(row)
         counts[case.kind] += 1

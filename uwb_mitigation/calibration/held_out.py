@@ -105,6 +105,20 @@ class HeldOut:
         gain = self._gain(self.live_m[base] ** 2, self.live_m[name] ** 2)
         return Gain(*(1.0 - math.sqrt(max(1.0 - decrease, 0.0)) for decrease in (gain.mean, gain.low)))
 
+    def refusal(self, name: str, baseline: str) -> str:
+        """Return why a correction does not help in comparison with the baseline; empty: it does.
+
+        The live position counts only with ground truth.
+        """
+        live = self.live_gain(name, baseline).low
+        if self.live_m and math.isnan(live):
+            return "there are too few live positions to compare"
+        if live <= 0.0:
+            return f"the live position is not clearly better than with {ranges_text(baseline)}"
+        if not self.range_gain(name, baseline).mean >= MIN_GAIN:
+            return f"the ranges are not better than with {ranges_text(baseline)}"
+        return ""
+
     def _gain(self, before: NDArray[np.float64], after: NDArray[np.float64]) -> Gain:
         """Return the relative decrease of the mean of n values, with the scatter of the decrease between blocks."""
         is_known = np.isfinite(before) & np.isfinite(after)
@@ -120,6 +134,11 @@ class HeldOut:
         return Gain(float(mean) / level, float(low) / level)
 
 
+def ranges_text(baseline: str) -> str:
+    """Return a baseline as part of a sentence."""
+    return "raw ranges" if baseline == RAW else f"the {baseline}"
+
+
 def decisive(error_sets: Sequence[HeldOut]) -> list[HeldOut]:
     """Return the separate drives, or if there are none, all parts."""
     return [errors for errors in error_sets if errors.is_separate] or list(error_sets)
@@ -130,8 +149,8 @@ def select(error_sets: Sequence[HeldOut], names: Sequence[str], baseline: str) -
 
     A more complex correction must improve significantly on each separate drive, and without any on the halves of the drive; the
     other parts must not become worse. With ground truth it must reduce the live position error, or the range error without
-    increasing the former: better ranges do not always give better positions. Relative to the baseline, that error must clearly
-    decrease everywhere.
+    increasing the former: better ranges do not always give better positions. `HeldOut.refusal` must accept it on
+    every part, if it accepts any.
 
     Args:
         error_sets: errors of each drive, or of its halves.
@@ -141,8 +160,6 @@ def select(error_sets: Sequence[HeldOut], names: Sequence[str], baseline: str) -
     decisive_sets = decisive(error_sets)
 
     def improves(errors: HeldOut, name: str, base: str) -> bool:
-        if errors.live_gain(name, baseline).low <= 0.0:
-            return False
         gain, live = errors.range_gain(name, base), errors.live_gain(name, base)
         if errors not in decisive_sets:
             return gain.mean > 0.0
@@ -150,8 +167,10 @@ def select(error_sets: Sequence[HeldOut], names: Sequence[str], baseline: str) -
             return gain.is_significant
         return live.is_significant or (gain.is_significant and live.mean > -MAX_INCREASE)
 
+    helpful = [name for name in names if not any(errors.refusal(name, baseline) for errors in error_sets)]
     best = names[0]
-    for name in names[1:]:
+    # If none helps, the best one is written on request.
+    for name in helpful or names:
         if all(improves(errors, name, best) for errors in error_sets):
             best = name
     return best

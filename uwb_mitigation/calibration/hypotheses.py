@@ -102,27 +102,20 @@ class AnchorHypotheses:
         antenna: NDArray[np.float64],
         tag: NDArray[np.intp] | None = None,
     ) -> None:
-        self._anchors, self._ranges, self._antenna = anchors, ranges, antenna
-        self._tag = np.zeros(len(ranges), np.intp) if tag is None else tag
-        self._misfits: dict[int, _Misfit | None] = {}
+        self._anchors = anchors
+        tag = np.zeros(len(ranges), np.intp) if tag is None else tag
         error_m = ranges.range_m - np.linalg.norm(antenna - anchors.position[ranges.anchor], axis=1)
-        self._common_m = float(np.nanmedian(error_m)) if np.isfinite(error_m).any() else 0.0
-
-    def _misfit(self, row: int) -> _Misfit | None:
-        """Return the misfit of an anchor; None: it has too few independent errors."""
-        if row not in self._misfits:
-            is_used = np.isfinite(self._antenna).all(axis=1) & (self._ranges.anchor == row)
-            rows = np.flatnonzero(is_used)
-            interval = self._ranges.stamp_ns[rows] // round(LIMITS.independent_s * NS_PER_S)
-            independent = np.unique(np.stack([interval, self._tag[rows]]), axis=1).shape[1]
-            misfit = None
+        common_m = float(np.nanmedian(error_m)) if np.isfinite(error_m).any() else 0.0
+        # Anchors with too few independent errors have none.
+        self._misfits: dict[int, _Misfit] = {}
+        for row in np.unique(ranges.anchor).tolist():
+            rows = np.flatnonzero(np.isfinite(error_m) & (ranges.anchor == row))
+            interval = ranges.stamp_ns[rows] // round(LIMITS.independent_s * NS_PER_S)
+            independent = np.unique(np.stack([interval, tag[rows]]), axis=1).shape[1]
             if independent >= LIMITS.min_independent:
                 rows = rows[:: math.ceil(len(rows) / _MAX_ANCHOR_RANGES)]
-                range_m = self._ranges.range_m[rows] - self._common_m
-                columns = self._antenna[rows], range_m, self._tag[rows]
-                misfit = _Misfit(*columns, independent / len(rows), self._anchors.position[row])
-            self._misfits[row] = misfit
-        return self._misfits[row]
+                columns = antenna[rows], ranges.range_m[rows] - common_m, tag[rows]
+                self._misfits[row] = _Misfit(*columns, independent / len(rows), anchors.position[row])
 
     def gain(self, row: int, *, is_independent: bool) -> float:
         """Return the gain in log likelihood of a displacement of this anchor; 0: within the limits.
@@ -134,7 +127,7 @@ class AnchorHypotheses:
         limit_m, explained_share = LIMITS.displacement_m, LIMITS.explained_share
         if is_independent:
             limit_m, explained_share = LIMITS.independent_m, LIMITS.independent_share
-        misfit = self._misfit(row)
+        misfit = self._misfits.get(row)
         if misfit is None or misfit.moved_m <= limit_m:
             return 0.0
         gain = misfit.loss - misfit.loss_at(misfit.best)
@@ -150,17 +143,17 @@ class AnchorHypotheses:
         Raises:
             DatasetError: names the anchors.
         """
-        rows = np.unique(self._ranges.anchor).tolist()
-        gains = {row: self.gain(row, is_independent=is_independent) for row in rows}
+        gains = {row: self.gain(row, is_independent=is_independent) for row in self._misfits}
         suspects = sorted((row for row in gains if gains[row] > LIMITS.gain), key=gains.__getitem__)
-        swaps = [
-            (self._swap_gain(a, b), a, b)
-            for a, b in itertools.combinations(suspects, 2)
-            # Two free displacements always fit better than a swap, but only slightly better if the anchors are swapped.
-            if self._swap_gain(a, b) > LIMITS.explained_share * (gains[a] + gains[b])
-        ]
+        swaps = {pair: self._swap_gain(*pair) for pair in itertools.combinations(suspects, 2)}
+        # Two free displacements always fit better than a swap, but only slightly better if the anchors are swapped.
+        swaps = {
+            (a, b): gain
+            for (a, b), gain in swaps.items()
+            if gain > LIMITS.explained_share * (gains[a] + gains[b])
+        }
         if swaps:
-            _, a, b = max(swaps)
+            a, b = max(swaps, key=swaps.__getitem__)
             raise _swapped(self._anchors, (min(a, b), max(a, b)), reference)
         if not suspects or (
             len(suspects) > 1
@@ -169,17 +162,14 @@ class AnchorHypotheses:
         ):
             return
         row = suspects[-1]
-        moved_m = getattr(self._misfit(row), "moved_m", 0.0)
         raise DatasetError(
-            f"anchor {self._anchors.anchors[row]} contradicts {reference}: {moved_m:.1f} m from its position in the anchors "
+            f"anchor {self._anchors.anchors[row]} contradicts {reference}: {self._misfits[row].moved_m:.1f} m from its position in the anchors "
             "file, it explains the ranges",
             valid=_REMEDY,
         )
 
     def _swap_gain(self, a: int, b: int) -> float:
-        first, second = self._misfit(a), self._misfit(b)
-        if first is None or second is None:
-            return 0.0
+        first, second = self._misfits[a], self._misfits[b]
         return first.loss + second.loss - first.loss_at(second.position) - second.loss_at(first.position)
 
     def mirror_image(self, row: int, axes: int) -> NDArray[np.float64] | None:
@@ -187,7 +177,7 @@ class AnchorHypotheses:
 
         The candidate is the mirror image beyond the plane of the track; with two `axes`, beyond its line in plan.
         """
-        misfit = self._misfit(row)
+        misfit = self._misfits.get(row)
         if misfit is None:
             return None
         centre, normal = misfit.antenna.mean(axis=0), np.zeros(3)

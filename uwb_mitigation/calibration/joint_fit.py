@@ -216,15 +216,6 @@ class JointFit:
         """Loss of all segments, to compare fits with the same scale."""
         return float(self.segment_loss.sum())
 
-    def covariances(self) -> NDArray[np.float64]:
-        """Return the covariances of the positions, float64 (K, 3, 3)."""
-        d, height = self.config.dims, self.config.height
-        covariance = np.zeros((len(self.position), 3, 3))
-        covariance[:, :d, :d] = self._solution.covariances(d)
-        if height is not None:
-            covariance[:, 2, 2] = height.sd**2
-        return covariance
-
     def antenna_position(self) -> NDArray[np.float64]:
         """Return the position of the tag's antenna at each observation, float64 (n, 3), m."""
         observations = self.observations
@@ -263,7 +254,7 @@ class JointFit:
             remaining = replace(self, observations=observations.without(left_out))
             try:
                 refit = remaining.positions_only(range_m[~left_out], replace(self.start(), parameters=None))
-                covariance = refit.covariances()
+                covariance = refit._solution.covariances(self.config.dims)
             except DatasetError:
                 continue
             received = np.zeros(len(observations.time_s), np.bool_)
@@ -272,8 +263,11 @@ class JointFit:
             tag = replace(refit, observations=observations).antenna_position()[is_near]
             antenna[is_near] = tag
             unit, _ = unit_vectors(tag, self.config.anchors.position[observations.anchor[is_near]])
-            covariance = covariance[observations.knot[is_near]]
-            sd_m[is_near] = np.sqrt(np.einsum("ni,nij,nj->n", unit, covariance, unit))
+            level, covariance = unit[:, : self.config.dims], covariance[observations.knot[is_near]]
+            variance = np.einsum("ni,nij,nj->n", level, covariance, level)
+            if self.config.height is not None:
+                variance += (unit[:, 2] * self.config.height.sd) ** 2
+            sd_m[is_near] = np.sqrt(variance)
         return antenna, sd_m
 
 

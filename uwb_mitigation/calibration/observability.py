@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from uwb_mitigation.calibration.hypotheses import LIMITS
 from uwb_mitigation.calibration.joint_fit import JointFit, Start, fit_joint
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.positioning.geometry import Area, Height, extents
+from uwb_mitigation.positioning.geometry import Area, Height, Symmetry, extents
 from uwb_mitigation.types.anchors import AnchorMap
 
 HEIGHTS_M = np.array([-2.0, -1.5, -1.0, 1.0, 1.5, 2.0])
@@ -85,11 +85,8 @@ def mirrored(fit: JointFit) -> NDArray[np.bool_]:
     """Return which segments have a mirror image beyond the anchors that explains the ranges equally well, bool (s,)."""
     config, observations = fit.config, fit.observations
     used = config.anchors.position[np.unique(observations.anchor)]
-    axes = slice(0, config.dims)
-    centre = used.mean(axis=0)
-    normal = np.zeros(3)
-    normal[axes] = np.linalg.svd(used[:, axes] - centre[axes])[2][-1]
-    image = fit.position - 2.0 * ((fit.position - centre) @ normal)[:, None] * normal
+    mirror = Symmetry.of(used, config.dims, 0.0)
+    image = np.concatenate([mirror.images(position) for position in fit.position])
     corrected = observations.range_m - observations.rows @ fit.parameters
     try:
         refit = fit.positions_only(corrected, Start(image))

@@ -380,53 +380,44 @@ class _AlignmentFit:
     def _normal_equations(
         self, rows: NDArray[np.float64], residual_m: NDArray[np.float64], is_used: NDArray[np.bool_]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        noise_group = self._problem.regressors.noise_group[is_used]
-        return _normal_equations(rows[is_used], residual_m[is_used], self._group[is_used], noise_group)
+        """Return normal matrix (q, q) and right side (q,) of the ranges `is_used`, robust against outliers among ranges and groups.
 
+        Random effects: the ranges of a group share an error of unknown variance. It does not affect what changes within the
+        group, and reduces the weight of the group's mean to that of one range (Searle, Casella, McCulloch, Variance Components,
+        1992, section 3.3). Both variances are estimated from the residuals, by medians.
 
-def _normal_equations(
-    rows: NDArray[np.float64],
-    residual_m: NDArray[np.float64],
-    group: NDArray[np.intp],
-    noise_group: NDArray[np.intp],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the normal matrix (q, q) and right side (q,) of n ranges, robust against outliers among ranges and groups.
+        Args:
+            rows: float64 (n, q), derivative of each range by each unknown.
+            residual_m: float64 (n,), residuals.
+            is_used: bool (n,).
+        """
+        index = np.flatnonzero(is_used)
+        index = index[np.argsort(self._group[index], kind="stable")]
+        rows, residual_m, group = rows[index], residual_m[index], self._group[index]
+        noise_group = self._problem.regressors.noise_group[index]
+        starts = np.flatnonzero(np.diff(group, prepend=group[0] - 1))
+        count = np.diff(np.append(starts, len(group)))
+        slot = np.repeat(np.arange(len(starts)), count)
+        kinds = int(noise_group.max(initial=0)) + 1
 
-    Random effects: the ranges of a group share an error of unknown variance. It does not affect what changes within the
-    group, and reduces the weight of the group's mean to that of one range (Searle, Casella, McCulloch, Variance Components,
-    1992, section 3.3). Both variances are estimated from the residuals, by medians.
-
-    Args:
-        rows: float64 (n, q), derivative of each range by each unknown.
-        residual_m: float64 (n,), residuals.
-        group: int (n,), ranges whose errors persist together have the same number.
-        noise_group: int (n,), ranges whose errors have the same standard deviation have the same number, from 0.
-    """
-    order = np.argsort(group, kind="stable")
-    rows, residual_m, group, noise_group = rows[order], residual_m[order], group[order], noise_group[order]
-    starts = np.flatnonzero(np.diff(group, prepend=group[0] - 1))
-    count = np.diff(np.append(starts, len(group)))
-    slot = np.repeat(np.arange(len(starts)), count)
-    kinds = int(noise_group.max(initial=0)) + 1
-
-    middle = np.array([np.median(values) for values in np.split(residual_m, starts[1:])])
-    within = residual_m - middle[slot]
-    # Of n values around their own median: n - 1 are left.
-    several = count[slot] > 1
-    larger = np.sqrt(count / np.maximum(count - 1.0, 1.0))[slot]
-    white = np.full(kinds, MIN_SD_M)
-    if several.any():
-        white = np.maximum(scatter_of((within * larger)[several], noise_group[several], kinds), MIN_SD_M)
-    weight = _MODEL.weight(within / white[noise_group]) / white[noise_group] ** 2
-    total = np.add.reduceat(weight, starts)
-    augmented = np.concatenate([rows, residual_m[:, None]], axis=1)
-    shared = np.add.reduceat(augmented * weight[:, None], starts) / total[:, None]
-    within_group = augmented - shared[slot]
-    weighted = within_group * weight[:, None]
-    kind = np.array([int(np.median(values)) for values in np.split(noise_group, starts[1:])])
-    spread = scatter_of(shared[:, -1], kind, kinds)[kind]
-    persists = np.sqrt(np.maximum(spread**2 - 1.0 / total, MIN_SD_M**2))
-    variance = persists**2 + 1.0 / total
-    of_group = _MODEL.weight(shared[:, -1] / np.sqrt(variance)) / variance
-    outer = weighted.T @ within_group + (shared * of_group[:, None]).T @ shared
-    return outer[:-1, :-1], outer[:-1, -1]
+        middle = np.array([np.median(values) for values in np.split(residual_m, starts[1:])])
+        within = residual_m - middle[slot]
+        # Of n values around their own median: n - 1 are left.
+        several = count[slot] > 1
+        larger = np.sqrt(count / np.maximum(count - 1.0, 1.0))[slot]
+        white = np.full(kinds, MIN_SD_M)
+        if several.any():
+            white = np.maximum(scatter_of((within * larger)[several], noise_group[several], kinds), MIN_SD_M)
+        weight = _MODEL.weight(within / white[noise_group]) / white[noise_group] ** 2
+        total = np.add.reduceat(weight, starts)
+        augmented = np.concatenate([rows, residual_m[:, None]], axis=1)
+        shared = np.add.reduceat(augmented * weight[:, None], starts) / total[:, None]
+        within_group = augmented - shared[slot]
+        weighted = within_group * weight[:, None]
+        kind = np.array([int(np.median(values)) for values in np.split(noise_group, starts[1:])])
+        spread = scatter_of(shared[:, -1], kind, kinds)[kind]
+        persists = np.sqrt(np.maximum(spread**2 - 1.0 / total, MIN_SD_M**2))
+        variance = persists**2 + 1.0 / total
+        of_group = _MODEL.weight(shared[:, -1] / np.sqrt(variance)) / variance
+        outer = weighted.T @ within_group + (shared * of_group[:, None]).T @ shared
+        return outer[:-1, :-1], outer[:-1, -1]

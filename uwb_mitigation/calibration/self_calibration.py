@@ -53,6 +53,7 @@ class SelfCalibration:
             regressors'.
         notes: messages about ranges that were left out.
         tag_ids: of the tags.
+        has_redundant_anchors: whether there are enough anchors for offsets of single ones.
         antenna: float64 (r, 3), in the order of `segments.ranges`: where the tag was according to the *other* anchors, m, and
             `distance_sd_m`, float64 (r,), the standard deviation of its distance from the anchor; NaN: unknown.
     """
@@ -63,6 +64,7 @@ class SelfCalibration:
     tag_ids: tuple[int, ...]
     antenna: NDArray[np.float64]
     distance_sd_m: NDArray[np.float64]
+    has_redundant_anchors: bool
 
     @property
     def distance_m(self) -> NDArray[np.float64]:
@@ -70,12 +72,6 @@ class SelfCalibration:
         anchor = self.fit.config.anchors.position[self.segments.ranges.anchor]
         distance_m: NDArray[np.float64] = np.linalg.norm(self.antenna - anchor, axis=1)
         return distance_m
-
-    @property
-    def has_redundant_anchors(self) -> bool:
-        """Whether there are enough anchors for offsets of single ones."""
-        anchors = len(np.unique(self.fit.observations.anchor))
-        return anchors >= self.fit.config.dims + MIN_REDUNDANT
 
     def pairs(self) -> list[tuple[int, int]]:
         """Return (tag number, anchor row) of all pairs with ranges."""
@@ -196,10 +192,11 @@ def self_calibrate(
             tag_ids=tuple(tag.tag_id for tag in tags),
             antenna=antenna[index],
             distance_sd_m=sd_m[index],
+            has_redundant_anchors=has_redundant_anchors,
         )
 
-    num_anchors = len(np.unique(segments.ranges.anchor))
-    is_raw = not extra.names and num_anchors >= config.dims + MIN_REDUNDANT
+    has_redundant_anchors = len(np.unique(segments.ranges.anchor)) >= config.dims + MIN_REDUNDANT
+    is_raw = not extra.names and has_redundant_anchors
     if near_offset_m is None:
         # The limits of these checks are for equal thresholds.
         result = solve(MODEL)

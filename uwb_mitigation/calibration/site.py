@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+import functools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.calibration.held_out import (
     BLOCK_S,
-    MIN_GAIN,
     PROMISED_SHARE,
     RAW,
     HeldOut,
     decisive,
+    ranges_text,
     select,
 )
 from uwb_mitigation.calibration.site_data import SiteData, read_site
@@ -73,24 +73,21 @@ SHIPPED = "shipped model alone"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SiteModel:
-    """A linear bias model, or if it `has_network` the universal network."""
+    """A model of the kind `NO_MODEL`, `LINE` or `NETWORK`, and the linear bias of its model card."""
 
+    kind: str
     linear_bias: LinearBiasModel
-    has_network: bool = False
-
-    @property
-    def is_line(self) -> bool:
-        """Whether it is a line in the received power."""
-        return self.linear_bias.needs_power
 
     def correction_m(self, site: SiteData) -> NDArray[np.float64]:
         """Return the predicted errors of all ranges, float64 (r,), m; 0 where a power that the line needs is unknown."""
-        if self.has_network:
-            return site.universal_m
+        if self.kind == NETWORK:
+            return site.table["universal_m"]
         line = self.linear_bias
         # Without a power gap, the first-path power is not needed.
-        first_path_dbm = site.first_path_power_dbm if line.per_power_gap else site.rx_power_dbm
-        predicted_m = line.predict_m(site.rx_power_dbm, first_path_dbm).astype(np.float64)
+        first_path_dbm = (
+            site.table["first_path_power_dbm"] if line.per_power_gap else site.table["rx_power_dbm"]
+        )
+        predicted_m = line.predict_m(site.table["rx_power_dbm"], first_path_dbm).astype(np.float64)
         return np.where(np.isfinite(predicted_m), predicted_m, 0.0)
 
 
@@ -163,27 +160,18 @@ class SiteCalibration:
         """Return why the calibration does not help; empty: it does."""
         for errors in self.held_out:
             drive = "on the drive of the check " if errors is not self.held_out[0] else ""
-            least_gain = errors.live_gain(self.chosen, self.baseline).low
-            if self.solution.truth is not None and math.isnan(least_gain):
-                return f"{drive}there are too few live positions to compare"
-            if least_gain <= 0.0:
-                return f"{drive}the live position is not clearly better than with {self._baseline_text}"
-            if not errors.range_gain(self.chosen, self.baseline).mean >= MIN_GAIN:
-                return f"{drive}the ranges are not better than with {self._baseline_text}"
+            if reason := errors.refusal(self.chosen, self.baseline):
+                return drive + reason
         is_raw = self.solution.truth is None and self.baseline == RAW
         if is_raw and not self.live_position_change <= -MIN_PROMISE:
             reason = self.solution.offsets_refused or "are not clearly better"
             return f"the locator estimates the common offset itself, and offsets of single anchors {reason}"
         return ""
 
-    @property
-    def _baseline_text(self) -> str:
-        return "raw ranges" if self.baseline == RAW else f"the {SHIPPED}"
-
     def summary(self) -> str:
         """Return the result in a sentence."""
         change = self.live_position_change
-        text = f"Compared with {self._baseline_text}, the live position error on another drive "
+        text = f"Compared with {ranges_text(self.baseline)}, the live position error on another drive "
         text += f"decreases by at least {-change:.0%}." if change < 0.0 else "is not expected to change."
         return f"Calibration does not help: {self.refusal}. {text}" if self.refusal else text
 
@@ -234,7 +222,7 @@ class SiteCalibration:
             "measurements": len(self.solution.rows),
             "split": "held out: halves of the drive",
             "started_from": f"{universal.model_id:08x}",
-            "recipe": {"line": model.linear_bias.needs_power, "network": model.has_network},
+            "recipe": {"line": model.kind == LINE, "network": model.kind == NETWORK},
             "metrics_m": {row: {"mae": round(value, 4)} for row, value in self.mae_m.items()},
         }
         card = replace(
@@ -244,7 +232,7 @@ class SiteCalibration:
             training=training,
         )
         network = universal.model
-        if model.is_line:
+        if model.kind == LINE:
             network = graph.float_model(scaled(float_network(universal), 0.0))
             data = _labelled(self.site, self.solution, self.level)
             fitted = output.stem, universal.architecture, data, model.linear_bias
@@ -328,25 +316,24 @@ def calibrate_site(
         solved = [solution.solve_part(half) for half in halves]
     except DatasetError as error:
         raise DatasetError(f"a half of the drive: {error}", valid="a longer drive") from error
-    first, second = zip(halves, solved, strict=True)
-    folds = _Fold(*first, second), _Fold(*second, first)
-    checks = [_Fold(drive, solution.solve_part(drive), (site, solution)) for drive in check]
-
     notes = list(solution.notes)
     corrections = {RAW: (NONE, NO_MODEL)}
     if site.has_cirs:
         corrections[SHIPPED] = NONE, NETWORK
-        if without_cir := int((~site.is_usable).sum()):
+        if without_cir := int((~site.table["is_usable"]).sum()):
             notes.append(f"{without_cir} ranges without a usable CIR are only used for track and offsets")
     else:
         notes.append("no networks: the recording has no CIRs that the universal model was trained for")
     baseline = list(corrections)[-1]
     candidates = {_name(level, kind): (level, kind) for level, kind in _candidates(site, solution)}
     corrections |= candidates
-    first_half, second_half = (
-        fold.evaluate(universal, corrections, is_separate=is_separate) for fold in folds
+    evaluate = functools.partial(_held_out, universal, corrections)
+    first, second = zip(halves, solved, strict=True)
+    first_half = evaluate(*first, second, is_separate=is_separate)
+    second_half = evaluate(*second, first, is_separate=is_separate)
+    drives = (
+        evaluate(drive, solution.solve_part(drive), (site, solution), is_separate=True) for drive in check
     )
-    drives = (fold.evaluate(universal, corrections, is_separate=True) for fold in checks)
     held_out = [first_half.merged(second_half, is_first), *drives]
     chosen = select(held_out, list(candidates), baseline)
     level, kind = candidates[chosen]
@@ -362,71 +349,66 @@ def calibrate_site(
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Fold:
-    """Ranges of a test and their reference, and what the corrections are fitted to."""
+def _held_out(
+    universal: Bundle,
+    corrections: Mapping[str, tuple[str, str]],
+    site: SiteData,
+    reference: SiteSolution,
+    training: tuple[SiteData, SiteSolution],
+    *,
+    is_separate: bool,
+) -> HeldOut:
+    """Return the errors of corrections, {name: (level of the offsets, kind of the model)}, that were fitted to other data."""
+    training_site, solution = training
+    block = site.ranges.stamp_ns // round(BLOCK_S * NS_PER_S)
+    residual_m, live_m = dict[str, NDArray[np.float64]](), dict[str, NDArray[np.float64]]()
+    for name, (level, kind) in corrections.items():
+        model = _fit(kind, training_site, solution, level)
+        predicted_m = np.where(site.table["is_usable"], model.correction_m(site), 0.0)
+        range_m = site.ranges.range_m - predicted_m
+        offsets = solution.offsets(level)
+        corrected_m = np.maximum(range_m - _offsets_m(site, offsets), 0.0)
+        # Without ground truth the track of the reference contains no common offset, because the locator estimates it.
+        remaining_m = solution.common_m - offsets.default if solution.truth is None else 0.0
+        residual_m[name] = reference.errors_of(corrected_m - remaining_m) + remaining_m
+        if solution.truth is not None:
+            # The locator does not use the variance of ranges that no model corrected.
+            variance_m2 = np.full(len(range_m), np.nan)
+            if model.kind == NETWORK:
+                unscored = np.zeros(len(range_m), np.float32)
+                rule = CorrectionRule(universal.card)
+                variance_m2 = rule.apply(predicted_m.astype(np.float32), unscored)[1].astype(np.float64)
+            elif model.kind == LINE:
+                intervals = fit_intervals(residual_m[name], predicted_m, block.astype(str))
+                variance_m2 = intervals.variance_of(predicted_m)
+            live_m[name] = _live_errors_m(site, reference, corrected_m, variance_m2)
+    return HeldOut(block, residual_m, live_m, is_separate)
 
-    site: SiteData
-    reference: SiteSolution
-    training: tuple[SiteData, SiteSolution]
 
-    def evaluate(
-        self,
-        universal: Bundle,
-        corrections: Mapping[str, tuple[str, str]],
-        *,
-        is_separate: bool,
-    ) -> HeldOut:
-        """Return the errors of corrections, {name: (level of the offsets, kind of the model)}."""
-        site, (training_site, solution) = self.site, self.training
-        block = site.ranges.stamp_ns // round(BLOCK_S * NS_PER_S)
-        residual_m, live_m = dict[str, NDArray[np.float64]](), dict[str, NDArray[np.float64]]()
-        for name, (level, kind) in corrections.items():
-            model = _fit(kind, training_site, solution, level)
-            predicted_m = np.where(site.is_usable, model.correction_m(site), 0.0)
-            range_m = site.ranges.range_m - predicted_m
-            offsets = solution.offsets(level)
-            corrected_m = np.maximum(range_m - _offsets_m(site, offsets), 0.0)
-            # Without ground truth the track of the reference contains no common offset, because the locator estimates it.
-            remaining_m = solution.common_m - offsets.default if solution.truth is None else 0.0
-            residual_m[name] = self.reference.errors_of(corrected_m - remaining_m) + remaining_m
-            if solution.truth is not None:
-                # The locator does not use the variance of ranges that no model corrected.
-                variance_m2 = np.full(len(range_m), np.nan)
-                if model.has_network:
-                    unscored = np.zeros(len(range_m), np.float32)
-                    rule = CorrectionRule(universal.card)
-                    variance_m2 = rule.apply(predicted_m.astype(np.float32), unscored)[1].astype(np.float64)
-                elif model.is_line:
-                    intervals = fit_intervals(residual_m[name], predicted_m, block.astype(str))
-                    variance_m2 = intervals.variance_of(predicted_m)
-                live_m[name] = self._live_errors_m(corrected_m, variance_m2)
-        return HeldOut(block, residual_m, live_m, is_separate)
-
-    def _live_errors_m(
-        self, range_m: NDArray[np.float64], variance_m2: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Return the error of the live position at each range, (r,), m; NaN: no position, or no reference."""
-        site, height = self.site, self.reference.height
-        corrected = replace(
-            site.ranges, range_m=range_m, variance_m2=variance_m2, is_corrected=np.isfinite(variance_m2)
-        )
-        error_m = np.full(len(range_m), np.nan)
-        axes = slice(0, 3 if height is None and site.height_m is None else 2)
-        for number in range(len(site.tags)):
-            rows = np.flatnonzero(site.tag == number)
-            ranges, heights = corrected.take(rows), None
-            if site.height_m is not None:
-                heights = Heights(ranges.stamp_ns, site.height_m[rows], np.full(len(rows), HEIGHT_SD_M**2))
-            config = EstimatorConfig(site.anchors, height=height, heights=heights)
-            track = TagEstimator(config).run(ranges)
-            if not len(track):
-                continue
-            index = np.searchsorted(track.stamp_ns, ranges.stamp_ns, side="right").clip(1) - 1
-            difference = track.position[index] - self.reference.antenna_position[rows]
-            has_position = track.stamp_ns[index] == ranges.stamp_ns
-            error_m[rows[has_position]] = np.linalg.norm(difference[has_position, axes], axis=1)
-        return error_m
+def _live_errors_m(
+    site: SiteData, reference: SiteSolution, range_m: NDArray[np.float64], variance_m2: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the error of the live position at each range, (r,), m; NaN: no position, or no reference."""
+    height = reference.height
+    corrected = replace(
+        site.ranges, range_m=range_m, variance_m2=variance_m2, is_corrected=np.isfinite(variance_m2)
+    )
+    error_m = np.full(len(range_m), np.nan)
+    axes = slice(0, 3 if height is None and site.height_m is None else 2)
+    for number in range(len(site.tags)):
+        rows = np.flatnonzero(site.tag == number)
+        ranges, heights = corrected.take(rows), None
+        if site.height_m is not None:
+            heights = Heights(ranges.stamp_ns, site.height_m[rows], np.full(len(rows), HEIGHT_SD_M**2))
+        config = EstimatorConfig(site.anchors, height=height, heights=heights)
+        track = TagEstimator(config).run(ranges)
+        if not len(track):
+            continue
+        index = np.searchsorted(track.stamp_ns, ranges.stamp_ns, side="right").clip(1) - 1
+        difference = track.position[index] - reference.antenna_position[rows]
+        has_position = track.stamp_ns[index] == ranges.stamp_ns
+        error_m[rows[has_position]] = np.linalg.norm(difference[has_position, axes], axis=1)
+    return error_m
 
 
 def _candidates(site: SiteData, solution: SiteSolution) -> list[tuple[str, str]]:
@@ -475,11 +457,12 @@ def _offsets_m(site: SiteData, offsets: Offsets) -> NDArray[np.float64]:
 def _fit(kind: str, site: SiteData, solution: SiteSolution, level: str) -> SiteModel:
     """Return a model of this kind for ranges with the offsets subtracted."""
     if kind != LINE:
-        return SiteModel(LinearBiasModel(0.0), has_network=kind == NETWORK)
+        return SiteModel(kind, LinearBiasModel(0.0))
     data = _labelled(site, solution, level)
     has_gap = bool(np.isfinite(data.rx_power_dbm - data.first_path_power_dbm).mean() > 0.5)
     first_path_dbm = data.first_path_power_dbm if has_gap else None
-    return SiteModel(fit_linear_bias(data.configurations, data.rx_power_dbm, first_path_dbm, data.error_m))
+    line = fit_linear_bias(data.configurations, data.rx_power_dbm, first_path_dbm, data.error_m)
+    return SiteModel(LINE, line)
 
 
 def _labelled(site: SiteData, solution: SiteSolution, level: str) -> Dataset:

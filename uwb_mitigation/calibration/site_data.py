@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,20 +36,22 @@ MIN_HALF = 0.3
 """Minimum share of the ranges in each part of a recording that is divided for a test."""
 
 
+_RANGE = [("tag", "u8"), ("stamp_ns", "i8"), ("anchor", "i8"), ("range_m", "f8"), ("height_m", "f8")]
+_CIR = [("rx_power_dbm", "f4"), ("first_path_power_dbm", "f4"), ("is_usable", "?"), ("universal_m", "f8")]
+COLUMNS = np.dtype([*_RANGE, *_CIR, ("recording", "i8")])
+"""A range: row of its anchor in the map; NaN: unknown. `is_usable`: a model can be fitted to it, the others only affect track and
+offsets. `universal_m`: prediction of the universal network, 0: none. `recording`: its number."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class SiteData:
     """Ranges of all tags of all recordings, one tag after the other.
 
     Attributes:
         anchors: anchors of the site.
-        tags: data of each tag, in the order of time.
+        table: `COLUMNS` (r,), by tag and time.
         preprocessing: preprocessing of the universal model.
-        rx_power_dbm, first_path_power_dbm: float32 (r,), NaN = unknown.
         has_cirs: whether CIRs are used.
-        is_usable: bool (r,), ranges to which a model can be fitted; the others only affect track and offsets.
-        universal_m: float64 (r,), predictions of the universal network, m; 0: none.
-        recording: int (r,), number of the recording of each range.
-        height_m: float64 (r,), measured heights of the tags; None: not measured.
         frame_ids: {tag id: the frame ids of its ranges}.
         skipped: {reason: number of excluded ranges}.
         shift_ns: time added to the stamps of each recording, so that recordings do not overlap.
@@ -56,15 +59,9 @@ class SiteData:
     """
 
     anchors: AnchorMap
-    tags: tuple[Ranges, ...]
+    table: NDArray[Any]
     preprocessing: Preprocessing
-    rx_power_dbm: NDArray[np.float32]
-    first_path_power_dbm: NDArray[np.float32]
     has_cirs: bool
-    is_usable: NDArray[np.bool_]
-    universal_m: NDArray[np.float64]
-    recording: NDArray[np.intp]
-    height_m: NDArray[np.float64] | None
     frame_ids: dict[int, tuple[str, ...]]
     skipped: Counter[str]
     shift_ns: tuple[int, ...]
@@ -73,44 +70,53 @@ class SiteData:
     @property
     def first_rows(self) -> NDArray[np.intp]:
         """Index of the first range of each tag."""
-        return np.cumsum([0, *map(len, self.tags)])[:-1].astype(np.intp)
+        return np.flatnonzero(np.diff(self.tag, prepend=-1))
 
     @property
     def ranges(self) -> Ranges:
         """Ranges of all tags."""
-        return Ranges.joined(self.tags)
+        names = ("stamp_ns", "anchor", "range_m", "rx_power_dbm")
+        stamp_ns, anchor, range_m, power_dbm = (np.ascontiguousarray(self.table[name]) for name in names)
+        return Ranges(stamp_ns, anchor, range_m, np.full(len(stamp_ns), np.nan), power_dbm.astype(np.float64))
+
+    @property
+    def tags(self) -> tuple[Ranges, ...]:
+        """Ranges of each tag, in the order of time."""
+        ranges, tag = self.ranges, self.tag
+        ids = self.table["tag"][self.first_rows].tolist()
+        return tuple(replace(ranges.take(tag == number), tag_id=tag_id) for number, tag_id in enumerate(ids))
 
     @property
     def tag(self) -> NDArray[np.intp]:
         """Index of the tag of each range, shape (r,)."""
-        return np.repeat(np.arange(len(self.tags)), list(map(len, self.tags)))
+        return np.unique(self.table["tag"], return_inverse=True)[1]
+
+    @property
+    def height_m(self) -> NDArray[np.float64] | None:
+        """Measured heights of the tags, float64 (r,), m; None: not measured."""
+        height_m: NDArray[np.float64] = self.table["height_m"]
+        return None if np.isnan(height_m).all() else height_m
 
     def select(self, is_selected: NDArray[np.bool_]) -> SiteData:
         """Return only these ranges, bool (r,), and the tags that have any."""
-        columns = ("rx_power_dbm", "first_path_power_dbm", "is_usable", "universal_m", "recording")
-        tags = [tag.take(is_selected[self.tag == number]) for number, tag in enumerate(self.tags)]
-        return replace(
-            self,
-            tags=tuple(tag for tag in tags if len(tag)),
-            height_m=None if self.height_m is None else self.height_m[is_selected],
-            **{name: getattr(self, name)[is_selected] for name in columns},
-        )
+        return replace(self, table=self.table[is_selected])
 
     def halves(self) -> tuple[NDArray[np.bool_], bool]:
         """Return which ranges belong to the first half, bool (r,), and whether the halves are separate recordings.
 
         The halves are separated between recordings if these allow it, or else by time, if possible in a pause.
         """
-        counts = np.cumsum(np.bincount(self.recording))
+        recording, stamp_ns = self.table["recording"], self.table["stamp_ns"]
+        counts = np.cumsum(np.bincount(recording))
         number = int(np.argmin(np.abs(counts - counts[-1] / 2.0)))
         if MIN_HALF <= counts[number] / counts[-1] <= 1.0 - MIN_HALF:
-            return self.recording <= number, True
-        stamps = np.sort(self.ranges.stamp_ns)
+            return recording <= number, True
+        stamps = np.sort(stamp_ns)
         first, last = (round(fraction * (len(stamps) - 1)) for fraction in (MIN_HALF, 1.0 - MIN_HALF))
         pauses = first + np.flatnonzero(np.diff(stamps[first : last + 1]) > GAP_S * NS_PER_S)
         middle = len(stamps) // 2
         cut = int(pauses[np.argmin(np.abs(pauses - middle))]) if len(pauses) else middle
-        return self.ranges.stamp_ns <= stamps[cut], False
+        return stamp_ns <= stamps[cut], False
 
     def to_dataset(
         self, rows: NDArray[np.intp], true_m: NDArray[np.float64], offset_m: NDArray[np.float64]
@@ -130,8 +136,8 @@ class SiteData:
         return Dataset(
             self.preprocessing,
             np.zeros((len(rows), self.preprocessing.samples), np.float32),
-            self.rx_power_dbm[rows],
-            self.first_path_power_dbm[rows],
+            self.table["rx_power_dbm"][rows],
+            self.table["first_path_power_dbm"][rows],
             ranges.range_m - offset_m,
             ranges.range_m - true_m - offset_m,
             np.array(names),
@@ -167,53 +173,33 @@ def read_site(
     shifts: list[int] = []
     for number, recording in enumerate(recordings):
         shift_ns: int | None = None
-        end_of_previous = table.last_stamp_ns
-        heights_of_recording = None if heights is None else heights[number]
+        end_ns = table.last_stamp_ns
         for record in recording:
             on_record()
             stamp_ns = record.measurement.stamp_ns + round(stamp_offset_s * NS_PER_S)
             if shift_ns is None:
-                shift_ns = 0
-                if end_of_previous is not None and stamp_ns <= end_of_previous:
-                    shift_ns = end_of_previous - stamp_ns + RECORDING_GAP_NS
+                shift_ns = end_ns - stamp_ns + RECORDING_GAP_NS if stamp_ns <= end_ns else 0
             height_m = None
-            if heights_of_recording is not None:
-                height_m = float(heights_of_recording.height_at(np.array([stamp_ns]))[0][0])
+            if heights is not None:
+                height_m = float(heights[number].height_at(np.array([stamp_ns]))[0][0])
             table.add(record.measurement, stamp_ns + shift_ns, height_m, number)
         shifts.append(shift_ns or 0)
     return table.to_site(tuple(shifts))
-
-
-_COLUMNS = np.dtype(
-    [
-        ("tag", np.uint64),
-        ("stamp_ns", np.int64),
-        ("anchor", np.intp),
-        ("range_m", np.float64),
-        ("rx_power_dbm", np.float64),
-        ("first_path_power_dbm", np.float64),
-        ("height_m", np.float64),
-        ("is_usable", np.bool_),
-        ("recording", np.intp),
-    ]
-)
 
 
 class _RangeTable:
     """Collects ranges row by row.
 
     Attributes:
-        last_stamp_ns: latest stamp; None: no range yet.
+        last_stamp_ns: latest stamp so far.
     """
 
     def __init__(self, anchors: AnchorMap, universal: Bundle) -> None:
-        self.last_stamp_ns: int | None = None
+        self.last_stamp_ns = -(1 << 63)
         self._anchors, self._universal = anchors, universal
         self._skipped, self._unknown_anchors = Counter[str](), Counter[int]()
-        self._rows: list[tuple[object, ...]] = []
-        self._windows: list[NDArray[np.float32]] = []
-        self._sources = CirSources()
-        self._frame_ids: dict[int, dict[str, None]] = {}
+        self._rows, self._windows = list[tuple[object, ...]](), list[NDArray[np.float32]]()
+        self._sources, self._frame_ids = CirSources(), dict[int, dict[str, None]]()
 
     def add(self, measured: RangeMeasurement, stamp_ns: int, height_m: float | None, recording: int) -> None:
         """Add a range, or count why it is skipped."""
@@ -226,18 +212,13 @@ class _RangeTable:
             self._skipped["no height at that time"] += 1
         else:
             self._frame_ids.setdefault(measured.tag_id, {}).setdefault(measured.frame_id)
-            card = self._universal.card
+            card, cir = self._universal.card, measured.cir
             (fault,), (window,) = card.preprocessing.windows_of([measured])
-            self.last_stamp_ns = max(stamp_ns, self.last_stamp_ns or stamp_ns)
-            cir = measured.cir
-            powers = (
-                dbm if math.isfinite(dbm) else math.nan
-                for dbm in (cir.rx_power_dbm, cir.first_path_power_dbm)
-            )
+            self.last_stamp_ns = max(stamp_ns, self.last_stamp_ns)
+            powers = cir.rx_power_dbm, cir.first_path_power_dbm
             is_usable = fault == 0 and is_trained_for(card, CirKind.of(cir))
-            self._rows.append(
-                (measured.tag_id, stamp_ns, row, measured.range_m, *powers, height_m, is_usable, recording)
-            )
+            columns = measured.tag_id, stamp_ns, row, measured.range_m, height_m, *powers, is_usable, 0.0
+            self._rows.append((*columns, recording))
             self._windows.append(window)
             self._sources.add(cir)
 
@@ -259,34 +240,24 @@ class _RangeTable:
                 f"{unknown_ids}",
                 valid=f"anchors of the file: {', '.join(map(format_id, sorted(self._anchors.index)))}",
             )
-        table = np.array(self._rows, _COLUMNS)
+        table = np.array(self._rows, COLUMNS)
         order = np.lexsort((table["stamp_ns"], table["tag"]))
-        column = {name: np.ascontiguousarray(table[name][order]) for name in _COLUMNS.names or ()}
-        unknown = np.full(len(table), np.nan)
-        ranges = Ranges(
-            column["stamp_ns"], column["anchor"], column["range_m"], unknown, column["rx_power_dbm"]
-        )
-        tags = tuple(
-            replace(ranges.take(rows), tag_id=int(column["tag"][rows[0]]))
-            for rows in np.split(np.arange(len(table)), np.flatnonzero(np.diff(column["tag"])) + 1)
-        )
-        is_usable = column["is_usable"]
+        table = table[order]
+        for name in ("rx_power_dbm", "first_path_power_dbm"):
+            table[name][~np.isfinite(table[name])] = np.nan
+        is_usable = table["is_usable"]
         has_cirs = bool(is_usable.mean() >= MIN_CIR_SHARE)
-        universal_m = np.zeros(len(table))
         if has_cirs:
             inputs = np.stack([self._windows[index] for index in order[is_usable]])
-            universal_m[is_usable] = predict_m(float_network(self._universal), inputs)
+            predicted_m = predict_m(float_network(self._universal), inputs)
+            table["universal_m"][is_usable] = np.nan_to_num(predicted_m, nan=0.0, posinf=0.0, neginf=0.0)
+        else:
+            is_usable[:] = True
         return SiteData(
             anchors=self._anchors,
-            tags=tags,
+            table=table,
             preprocessing=self._universal.preprocessing,
-            rx_power_dbm=column["rx_power_dbm"].astype(np.float32),
-            first_path_power_dbm=column["first_path_power_dbm"].astype(np.float32),
             has_cirs=has_cirs,
-            is_usable=is_usable if has_cirs else np.ones(len(table), np.bool_),
-            universal_m=np.nan_to_num(universal_m, nan=0.0, posinf=0.0, neginf=0.0),
-            recording=column["recording"],
-            height_m=None if np.isnan(column["height_m"]).all() else column["height_m"],
             frame_ids={tag_id: tuple(names) for tag_id, names in self._frame_ids.items()},
             skipped=self._skipped,
             shift_ns=shift_ns,

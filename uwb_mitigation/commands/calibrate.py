@@ -119,12 +119,8 @@ def calibrate(
     check_output(output)
     check_replaceable((output, offsets_file(output), *([report] if report else [])), force)
     given_arm_m = parse_lever_arm(lever_arm)
-    if truth_topic is None and (frames, time_offset, given_arm_m, estimate_lever_arm) != (
-        None,
-        None,
-        None,
-        False,
-    ):
+    truth_options = frames, time_offset, given_arm_m, estimate_lever_arm or None
+    if truth_topic is None and any(option is not None for option in truth_options):
         raise ParameterError(
             "--frames, --time-offset, --lever-arm or --estimate-lever-arm without --truth-topic",
             valid="with --truth-topic",
@@ -159,13 +155,9 @@ def calibrate(
             calibration = calibrate_site(site, source, solution, check=drives)
     except DatasetError as error:
         # --force does not override this: the anchors, the offsets or the geometry are wrong.
-        refused: dict[str, object] = {
-            "offsets_m": {},
-            "raw_mae_m": None,
-            "calibrated_mae_m": None,
-            "live_position_change": None,
-        }
-        console.write_json(json, refused, {"truth": truth_topic or "none", "refused": error})
+        unknown = dict.fromkeys(("raw_mae_m", "calibrated_mae_m", "live_position_change"))
+        refused = {"offsets_m": {}, "truth": truth_topic or "none", "refused": error}
+        console.write_json(json, unknown, refused)
         raise
     _show(calibration)
     if calibration.refusal and not force:
@@ -307,7 +299,7 @@ def _show(calibration: SiteCalibration) -> None:
             calibration.site.tags, alignment.lever_arm_m, alignment.lever_arm_sd_m, strict=True
         ):
             values = ", ".join(
-                f"{value:.3f}" + ("" if sd == 0.0 or math.isnan(sd) else f" +- {sd:.3f}")
+                f"{value:.3f}" + (f" +- {sd:.3f}" if sd > 0.0 else "")
                 for value, sd in zip(lever_arm_m.tolist(), arm_sd.tolist(), strict=True)
             )
             print_line(f"tag {format_id(ranges.tag_id)}: lever arm {values} m")
