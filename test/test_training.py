@@ -15,11 +15,10 @@ from typer.testing import CliRunner
 from uwb_mitigation.commands.cli import app
 from uwb_mitigation.errors import DatasetError, ParameterError
 from uwb_mitigation.mitigation.model import floating, graph
-from uwb_mitigation.mitigation.model.architecture import HEAD, Mlp, Remnet
+from uwb_mitigation.mitigation.model.architecture import Mlp, Remnet
 from uwb_mitigation.mitigation.model.bundle import Session, load_bundle, save_bundle
 from uwb_mitigation.mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
-from uwb_mitigation.mitigation.model.weights import FloatWeights
 from uwb_mitigation.mitigation.preprocessing import Scaling
 from uwb_mitigation.training.fit.linear_fit import fit_linear_bias, least_absolute_deviations
 from uwb_mitigation.training.fit.quantisation import quantise_network
@@ -134,24 +133,6 @@ def test_card_contains_the_errors_on_held_out_configurations(validation):
     assert card.training["metrics_m"]["raw"]["mae"] == round(float(np.abs(data.error_m).mean()), 4)
 
 
-def weights_of(shape: Mlp | Remnet) -> FloatWeights:
-    if isinstance(shape, Remnet):
-        return random_weights(shape)
-    generator = np.random.default_rng(0)
-    weight = {
-        layer.name: generator.normal(0, (2 / layer.inputs) ** 0.5, (layer.outputs, layer.inputs))
-        for layer in shape.layers
-    }
-    weight[HEAD] = generator.normal(0, 0.3, (shape.features, 1))
-    bias = {layer.name: generator.normal(0, 0.1, layer.outputs) for layer in shape.layers}
-    bias[HEAD] = generator.normal(0, 0.1, 1)
-    return FloatWeights(
-        shape,
-        {name: values.astype(np.float32) for name, values in weight.items()},
-        {name: values.astype(np.float32) for name, values in bias.items()},
-    )
-
-
 @pytest.mark.parametrize(
     "shape",
     [
@@ -165,7 +146,7 @@ def weights_of(shape: Mlp | Remnet) -> FloatWeights:
     ],
 )
 def test_torch_and_numpy_compute_the_same(shape):
-    weights = weights_of(shape)
+    weights = random_weights(shape)
     inputs = windows(20, shape.samples)
     with torch.no_grad():
         computed = build_network(shape, 0.5, weights).eval()(torch.from_numpy(inputs)).numpy()
@@ -175,7 +156,7 @@ def test_torch_and_numpy_compute_the_same(shape):
 @pytest.mark.parametrize("quantised", [True, False])
 @pytest.mark.parametrize("shape", [Mlp(16, (12, 8)), Remnet(16)])
 def test_bundle_loads_and_runs(tmp_path, shape, quantised):
-    weights = weights_of(shape)
+    weights = random_weights(shape)
     integers = quantise_network(weights, windows(50, 16), exact=False)
     model = graph.int8_model(integers) if quantised else graph.float_model(weights)
     save_bundle(tmp_path / "mlp.onnx", model, card(shape, quantised=quantised))
