@@ -23,7 +23,14 @@ from uwb_mitigation.types.measurement import (
     Truth,
 )
 from uwb_mitigation.types.ros import codec, schemas
-from uwb_mitigation.types.ros.topics import RANGE_CIR_TYPE, RANGE_RAW, RANGE_TRUTH, RANGE_TRUTH_TYPE
+from uwb_mitigation.types.ros.topics import (
+    RANGE_CIR_TYPE,
+    RANGE_CORRECTED,
+    RANGE_CORRECTED_TYPE,
+    RANGE_RAW,
+    RANGE_TRUTH,
+    RANGE_TRUTH_TYPE,
+)
 
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000
@@ -56,7 +63,7 @@ def corrected(number: int) -> CorrectedRange:
 def write_corrected(bag: BagWriter, measurement: RangeMeasurement, corrected: CorrectedRange) -> None:
     """Write the corrected range of a measurement, with the time of the measurement."""
     data, stamp_ns = codec.encode_corrected(measurement, corrected), measurement.stamp_ns
-    bag.write_serialized(bag.corrected_channel(), data, stamp_ns, stamp_ns, measurement.sequence)
+    bag.write_message(RANGE_CORRECTED, RANGE_CORRECTED_TYPE, data, stamp_ns, measurement.sequence)
 
 
 def write_records(

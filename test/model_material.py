@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from uwb_mitigation.mitigation.model import graph
-from uwb_mitigation.mitigation.model.architecture import HEAD, Mlp, Remnet
+from uwb_mitigation.mitigation.model.architecture import HEAD, Architecture, Remnet
 from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard, save_bundle
 from uwb_mitigation.mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
@@ -22,18 +22,14 @@ from uwb_mitigation.types.measurement import Cir, Encoding, RangeMeasurement, Re
 LINE = LinearBiasModel(*(float(np.float32(value)) for value in (-5.0, -0.0691, -0.0126)))
 
 
-def random_weights(architecture: Remnet | Mlp, seed: int = 0) -> FloatWeights:
+def random_weights(architecture: Architecture, seed: int = 0) -> FloatWeights:
     """Return the weights of a new network, with nonzero biases and head."""
     generator = np.random.default_rng(seed)
     weight, bias = {}, {}
-    if isinstance(architecture, Mlp):
-        shapes = {layer.name: (layer.outputs, layer.inputs) for layer in architecture.layers}
-    else:
-        shapes = {each.name: (each.filters, each.inputs, each.kernel) for each in architecture.convolutions}
-    for name, shape in shapes.items():
-        spread = math.sqrt(2 / math.prod(shape[1:]))
-        weight[name] = generator.normal(0, spread, shape).astype(np.float32)
-        bias[name] = generator.normal(0, 0.1, shape[0]).astype(np.float32)
+    for layer in architecture.layers:
+        spread = math.sqrt(2 / math.prod(layer.weight_shape[1:]))
+        weight[layer.name] = generator.normal(0, spread, layer.weight_shape).astype(np.float32)
+        bias[layer.name] = generator.normal(0, 0.1, layer.weight_shape[0]).astype(np.float32)
     weight[HEAD] = generator.normal(0, 0.02, (architecture.features, 1)).astype(np.float32)
     bias[HEAD] = generator.normal(0, 0.1, 1).astype(np.float32)
     return FloatWeights(architecture, weight, bias)

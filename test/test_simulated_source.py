@@ -93,6 +93,7 @@ def test_levels_are_of_the_order_of_real_logs(drive: list[Record]) -> None:
 def test_command_writes_a_bag_marked_as_simulated(tmp_path: Path, like: str) -> None:
     ranges = 100
     words = ["data", "simulate", "--like", like, "--ranges", str(ranges), "-o", str(tmp_path / "sim.mcap")]
+    words += ["--channel", "5"]
     done = CliRunner().invoke(app, [*words, "--json", str(tmp_path / "sim.json")])
     assert done.exit_code == 0, done.output
     assert "simulated" in done.stdout
@@ -102,16 +103,25 @@ def test_command_writes_a_bag_marked_as_simulated(tmp_path: Path, like: str) -> 
     assert result["ranges"] == ranges - lost
     read = McapRecording(tmp_path / "sim.mcap")
     assert read.simulated
-    assert sum(1 for _ in read) == result["ranges"]
+    assert [record.measurement.cir.channel for record in read] == [5] * result["ranges"]
     again = CliRunner().invoke(app, words)
     assert "--force" in str(again.exception)
 
 
-@pytest.mark.parametrize("words", ["--like buildings --ranges 30", "--like buildings --exchanges 0"])
-def test_a_part_of_a_placement_is_refused(tmp_path: Path, words: str) -> None:
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--like buildings --ranges 30", "a multiple of"),
+        ("--like buildings --exchanges 0", "a multiple of"),
+        ("--channel 6", "unknown channel 6"),
+    ],
+)
+def test_a_part_of_a_placement_or_an_unknown_channel_is_refused(
+    tmp_path: Path, words: str, message: str
+) -> None:
     done = CliRunner().invoke(app, ["data", "simulate", "-o", str(tmp_path / "sim.mcap"), *words.split()])
     assert isinstance(done.exception, ParameterError)
-    assert "a multiple of" in str(done.exception)
+    assert message in str(done.exception)
     assert not list(tmp_path.iterdir())
 
 

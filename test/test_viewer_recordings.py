@@ -25,6 +25,8 @@ from uwb_mitigation.types.ros.topics import (
     ODOMETRY_TRUTH,
     ODOMETRY_TYPE,
     RANGE_CIR_TYPE,
+    RANGE_CORRECTED,
+    RANGE_CORRECTED_TYPE,
     RANGE_RAW,
     RANGE_TRUTH,
     RANGE_TRUTH_TYPE,
@@ -62,7 +64,7 @@ def write_drive(
     """
     ranges, truth = drive(seconds=40.0, rate_hz=25.0)
     with BagWriter(path, {}) as out:
-        channel = out.corrected_channel()
+        channel = out.channel(RANGE_CORRECTED, RANGE_CORRECTED_TYPE)
         for tag, delay_s in delays_s.items():
             for row in range(len(ranges)):
                 time_s = ranges.stamp_ns[row] / 1e9

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.mitigation.model.architecture import HEAD, Mlp, Remnet
+from uwb_mitigation.mitigation.model.architecture import HEAD, Architecture, Mlp, Remnet
 from uwb_mitigation.mitigation.model.weights import FloatWeights, Int8Weights
 from uwb_mitigation.training.fit.quantisation import quantise_network
 
@@ -18,30 +18,27 @@ def remnet(samples: int, first_kernel: int, modules: int = 3, seed: int = 0) -> 
     """A REMNet with random weights, quantised on random calibration inputs."""
     random = np.random.default_rng([seed, samples, first_kernel, modules])
     architecture = Remnet(samples, first_kernel=first_kernel, modules=modules)
-    weight, bias = {}, {}
-    for layer in architecture.convolutions:
-        sd = np.sqrt(2 / (layer.inputs * layer.kernel))
-        shape = (layer.filters, layer.inputs, layer.kernel)
-        weight[layer.name] = random.normal(0.1, sd, shape).astype(np.float32)
-        bias[layer.name] = random.normal(0, 0.1, layer.filters).astype(np.float32)
-    weight[HEAD] = random.normal(0, 0.05, (architecture.features, 1)).astype(np.float32)
-    bias[HEAD] = random.normal(0, 0.1, 1).astype(np.float32)
-    calibration = random.gamma(0.5, 0.5, (64, samples)).astype(np.float32)
-    return quantise_network(FloatWeights(architecture, weight, bias), calibration)
+    return _quantised(architecture, random, mean=0.1, head_sd=0.05)
 
 
 def mlp(samples: int = 157, seed: int = 0) -> Int8Weights:
     """The paper's MLP with random weights, quantised on random calibration inputs."""
     random = np.random.default_rng([seed, samples])
-    architecture = Mlp(samples)
+    return _quantised(Mlp(samples), random, mean=0.0, head_sd=0.2)
+
+
+def _quantised(
+    architecture: Architecture, random: np.random.Generator, mean: float, head_sd: float
+) -> Int8Weights:
+    """Draw weights with a mean, and those of the head with a standard deviation, and quantise them."""
     weight, bias = {}, {}
     for layer in architecture.layers:
-        sd = np.sqrt(2 / layer.inputs)
-        weight[layer.name] = random.normal(0, sd, (layer.outputs, layer.inputs)).astype(np.float32)
-        bias[layer.name] = random.normal(0, 0.1, layer.outputs).astype(np.float32)
-    weight[HEAD] = random.normal(0, 0.2, (architecture.features, 1)).astype(np.float32)
+        sd = np.sqrt(2 / np.prod(layer.weight_shape[1:]))
+        weight[layer.name] = random.normal(mean, sd, layer.weight_shape).astype(np.float32)
+        bias[layer.name] = random.normal(0, 0.1, layer.weight_shape[0]).astype(np.float32)
+    weight[HEAD] = random.normal(0, head_sd, (architecture.features, 1)).astype(np.float32)
     bias[HEAD] = random.normal(0, 0.1, 1).astype(np.float32)
-    calibration = random.gamma(0.5, 0.5, (64, samples)).astype(np.float32)
+    calibration = random.gamma(0.5, 0.5, (64, architecture.samples)).astype(np.float32)
     return quantise_network(FloatWeights(architecture, weight, bias), calibration)
 
 

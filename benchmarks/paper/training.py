@@ -61,7 +61,7 @@ class NetworkStack(nn.Module):
                 layer.name.replace(".", "_"): self._layer(
                     layer.inputs, layer.filters, layer.kernel, layer.stride, layer.padding
                 )
-                for layer in architecture.convolutions
+                for layer in architecture.layers
             }
             head = self._layer(architecture.filters, 1, architecture.lengths[-1])
         self.layers, self.head, self.dropout = nn.ModuleDict(layers), head, nn.Dropout(dropout)

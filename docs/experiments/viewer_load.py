@@ -37,7 +37,7 @@ from uwb_mitigation.types.measurement import (
     Status,
 )
 from uwb_mitigation.types.ros.codec import MeasurementKey, encode_corrected
-from uwb_mitigation.types.ros.topics import RANGE_CORRECTED, RANGE_RAW
+from uwb_mitigation.types.ros.topics import RANGE_CORRECTED, RANGE_CORRECTED_TYPE, RANGE_RAW
 from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.playback import BagPlayer
 from uwb_mitigation.viewer.scene import Pose, Scene
@@ -105,7 +105,7 @@ def write_long(path: Path) -> None:
     """Write a recording with one tag."""
     ranges, _ = drive(seconds=LONG / LONG_HZ, rate_hz=LONG_HZ)
     with BagWriter(path, {}) as out:
-        channel = out.corrected_channel()
+        channel = out.channel(RANGE_CORRECTED, RANGE_CORRECTED_TYPE)
         for row in range(len(ranges)):
             stamp_ns, range_m = START_NS + int(ranges.stamp_ns[row]), float(ranges.range_m[row])
             anchor = HALL.anchors[ranges.anchor[row]].id

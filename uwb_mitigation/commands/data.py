@@ -14,7 +14,7 @@ import typer
 from uwb_mitigation.commands.support import console
 from uwb_mitigation.commands.support.checks import output_option
 from uwb_mitigation.commands.support.console import JsonOption, print_line, show_table
-from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError
+from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError, check_name
 from uwb_mitigation.types.stamps import NS_PER_S
 
 if TYPE_CHECKING:
@@ -100,6 +100,7 @@ def simulate(
     ] = 20_000,
     exchanges: Annotated[int, typer.Option(help="Exchanges of each static placement (buildings).")] = 20,
     anchors: Annotated[int, typer.Option(help="Number of anchors of a drive, 4 to 8.")] = 4,
+    channel: Annotated[int, typer.Option(help="UWB channel: 1 to 5, or 7.")] = 2,
     force: ForceOption = False,
     json: JsonOption = None,
 ) -> None:
@@ -108,7 +109,7 @@ def simulate(
     The bag is marked as simulated. A drive also contains `/odom`, `/imu` and `/tf` (odom to base_link) of the robot,
     with a scale error of 2 %, drift and slip. The antenna of the tag is at the origin of base_link.
     """
-    source = simulated_source(like, seed, ranges, exchanges, anchors)
+    source = simulated_source(like, seed, ranges, exchanges, anchors, channel)
     write_simulated(source, ranges, seed, output, force, json)
 
 
@@ -221,23 +222,25 @@ def _motion_of(source: Source, start_ns: int) -> tuple[Odometry, Imu | None] | N
     return replace(motion.odometry, stamp_ns=stamps), replace(motion.imu, stamp_ns=stamps)
 
 
-def simulated_source(like: str, seed: int, ranges: int, exchanges: int, anchors: int = 4) -> Source:
+def simulated_source(like: str, seed: int, ranges: int, exchanges: int, anchors: int, channel: int) -> Source:
     """Return the simulator's source.
 
     Raises:
         ParameterError: a number is out of its range.
     """
+    from uwb_mitigation.simulation.channel import CHANNELS
     from uwb_mitigation.simulation.simulated import SimulatedBuildings, SimulatedSource
 
+    check_name("channel", channel, CHANNELS)
     if like == "buildings":
         if exchanges < 1 or ranges % exchanges:
             raise ParameterError(
                 f"{ranges} ranges of {exchanges} exchanges a placement", valid="a multiple of the exchanges"
             )
-        return SimulatedBuildings(seed=seed, placements=ranges // exchanges, exchanges=exchanges)
+        return SimulatedBuildings(seed, ranges // exchanges, exchanges, CHANNELS[channel])
     if ranges < 1:
         raise ParameterError(f"{ranges} ranges", valid="1 or more: a drive is endless")
-    return SimulatedSource.with_anchors(anchors, seed=seed, count=ranges)
+    return SimulatedSource.with_anchors(anchors, seed=seed, count=ranges, channel=CHANNELS[channel])
 
 
 def _open(path: Path, cir: Literal["final", "poll"]) -> Source:

@@ -8,9 +8,10 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
-from uwb_mitigation.errors import RecordingError, did_you_mean
-from uwb_mitigation.recordings.bag.reader import BagReader, check_channel
+from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.recordings.bag.reader import BagReader
 from uwb_mitigation.types.measurement import RangeMeasurement, Record, Truth
 from uwb_mitigation.types.ros import topics
 from uwb_mitigation.types.ros.codec import MeasurementKey, decode_range, decode_truth, measurement_key
@@ -55,14 +56,8 @@ class McapRecording(Source):
             yield from self._join(bag)
         finally:
             self.skipped.update(bag.warnings)
-        if not self._closed and self._topic not in bag.topics:
-            listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(bag.topics.items()))
-            raise RecordingError(
-                f"no topic {self._topic}",
-                where=str(self._path),
-                valid=f"the bag contains: {listed or 'no topic'}",
-                suggestion=did_you_mean(self._topic, bag.topics),
-            )
+        if not self._closed:
+            bag.require(self._topic)
 
     def close(self) -> None:
         """End an iteration at its next message; files are open only while iterating."""
@@ -72,8 +67,11 @@ class McapRecording(Source):
         """Pair ranges with their truths, which may come before or after them; in the order of the ranges."""
         pending: deque[tuple[MeasurementKey, RangeMeasurement]] = deque()
         truths: dict[MeasurementKey, Truth] = {}
-        poses: dict[tuple[int, int], TruePose] = {}
+        poses: dict[tuple[int, int], tuple[Any, ...]] = {}
+        types = {self._topic: topics.RANGE_CIR_TYPE, topics.RANGE_TRUTH: topics.RANGE_TRUTH_TYPE}
         has_poses = bag.topics.get(topics.ODOMETRY_TRUTH) == topics.ODOMETRY_TYPE
+        if has_poses:
+            types[topics.ODOMETRY_TRUTH] = ""
 
         def oldest_is_complete() -> bool:
             key, _ = pending[0]
@@ -81,21 +79,28 @@ class McapRecording(Source):
 
         def pop_oldest() -> Record:
             key, oldest = pending.popleft()
-            return Record(oldest, truths.pop(key, None), *poses.get((key.stamp_ns, key.tag_id), (None, None)))
+            return Record(oldest, truths.pop(key, None), *poses.get((key.stamp_ns, key.tag_id), ()))
 
         try:
-            for item in self._decoded(bag):
-                if isinstance(item, RangeMeasurement):
-                    pending.append((measurement_key(item), item))
-                elif len(item) == 2:
-                    truths[item[0]] = item[1]
-                    if len(truths) > 2 * JOIN_WINDOW:
-                        del truths[next(iter(truths))]
-                        self.skipped["truth without its range"] += 1
-                else:
-                    poses[item[:2]] = item[2:]
-                    if len(poses) > 2 * JOIN_WINDOW:
-                        del poses[next(iter(poses))]
+            for message in bag.checked_messages(types):
+                if self._closed:
+                    break
+                try:
+                    if message.channel.topic == self._topic:
+                        measured = decode_range(message.data)
+                        pending.append((measurement_key(measured), measured))
+                    elif message.channel.topic == topics.RANGE_TRUTH:
+                        key, truth = decode_truth(message.data)
+                        truths[key] = truth
+                    elif position := decode_true_position(message.data):
+                        poses[position[:2]] = position[2:]
+                except RecordingError as error:
+                    self.skipped[error.what] += 1
+                if len(truths) > 2 * JOIN_WINDOW:
+                    del truths[next(iter(truths))]
+                    self.skipped["truth without its range"] += 1
+                if len(poses) > 2 * JOIN_WINDOW:
+                    del poses[next(iter(poses))]
                 while pending and (len(pending) > JOIN_WINDOW or oldest_is_complete()):
                     yield pop_oldest()
         except RecordingError:
@@ -106,35 +111,3 @@ class McapRecording(Source):
             yield pop_oldest()
         if truths:
             self.skipped["truth without its range"] += len(truths)
-
-    def _decoded(
-        self, bag: BagReader
-    ) -> Iterator[RangeMeasurement | tuple[MeasurementKey, Truth] | TruePosition]:
-        checked_channels: set[int] = set()
-        types = {self._topic: topics.RANGE_CIR_TYPE, topics.RANGE_TRUTH: topics.RANGE_TRUTH_TYPE}
-        if bag.topics.get(topics.ODOMETRY_TRUTH) == topics.ODOMETRY_TYPE:
-            types[topics.ODOMETRY_TRUTH] = topics.ODOMETRY_TYPE
-        for message in bag.messages(types):
-            if self._closed:
-                return
-            topic = message.channel.topic
-            # The bag keeps references to its channels, so that an id() identifies one channel of one file.
-            if id(message.channel) not in checked_channels and topic != topics.ODOMETRY_TRUTH:
-                check_channel(message.channel, types[topic], self._path)
-                checked_channels.add(id(message.channel))
-            try:
-                if topic == self._topic:
-                    yield decode_range(message.data)
-                elif topic == topics.RANGE_TRUTH:
-                    yield decode_truth(message.data)
-                elif (decoded := decode_true_position(message.data)) is not None:
-                    yield decoded
-            except RecordingError as error:
-                self.skipped[error.what] += 1
-
-
-TruePosition = tuple[int, int, tuple[float, float, float], float | None]
-"""Stamp and tag of a true position, the position, and its yaw."""
-
-TruePose = tuple[tuple[float, float, float], float | None]
-"""A true position and yaw."""

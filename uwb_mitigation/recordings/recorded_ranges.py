@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import RecordingError, format_id
 from uwb_mitigation.recordings.bag.pose_paths import read_truth
-from uwb_mitigation.recordings.bag.reader import BagReader, check_channel
+from uwb_mitigation.recordings.bag.reader import BagReader
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.measurement import CORRECTED, CorrectedRange, RangeMeasurement, Record
 from uwb_mitigation.types.ros.codec import MeasurementKey, decode_corrected, decode_range, measurement_key
@@ -200,18 +200,14 @@ def read_ranges(
         RecordingError: the bag cannot be read, or has no range of an anchor in the map.
     """
     bag, table = BagReader(path), RangeTable()
-    checked = set[int]()
-    for message in bag.messages((RANGE_RAW, RANGE_CORRECTED)):
-        is_raw = message.channel.topic == RANGE_RAW
-        if id(message.channel) not in checked:
-            check_channel(message.channel, RANGE_CIR_TYPE if is_raw else RANGE_CORRECTED_TYPE, path)
-            checked.add(id(message.channel))
+    types = {RANGE_RAW: RANGE_CIR_TYPE, RANGE_CORRECTED: RANGE_CORRECTED_TYPE}
+    for message in bag.checked_messages(types):
         try:
-            if is_raw:
+            if message.channel.topic == RANGE_RAW:
                 table.add_raw(decode_range(message.data))
             else:
                 table.add_corrected(*decode_corrected(message.data))
-        except RecordingError as error:
+        except RecordingError as error:  # noqa: PERF203
             table.skipped[error.what] += 1
     if RANGE_CORRECTED not in bag.topics:
         for record, result in corrected:

@@ -20,7 +20,7 @@ from uwb_mitigation.errors import ParameterError, check_range
 from uwb_mitigation.simulation.antenna_pairs import AntennaPairs, Environments, draw_fields, label
 from uwb_mitigation.simulation.buildings import PLACEMENTS, RESIDENTIAL, Block, block_of
 from uwb_mitigation.simulation.buildings import RADIO as BUILDINGS_RADIO
-from uwb_mitigation.simulation.channel import DiffuseField
+from uwb_mitigation.simulation.channel import CHANNEL_2, Channel, DiffuseField
 from uwb_mitigation.simulation.odometry import SimulatedMotion, simulate_motion, yaw_along_route
 from uwb_mitigation.simulation.radio import Boards, Receiver, Reception
 from uwb_mitigation.simulation.scene import ANCHORS, FLAT, MORE_ANCHORS, ROUTE, Building, Point, along_route
@@ -174,7 +174,9 @@ class SimulatedSource(Simulated):
         self._spacing_m = float(np.hypot(*np.diff(closed, axis=0).T).sum()) / tags
 
     @classmethod
-    def with_anchors(cls, number: int, *, seed: int, count: int, rate_hz: float = 20.0) -> SimulatedSource:
+    def with_anchors(
+        cls, number: int, *, seed: int, count: int, rate_hz: float = 20.0, channel: Channel = CHANNEL_2
+    ) -> SimulatedSource:
         """Return a drive through the default flat past 4 to 8 anchors.
 
         Raises:
@@ -182,7 +184,8 @@ class SimulatedSource(Simulated):
         """
         anchors = ANCHORS + MORE_ANCHORS
         check_range("simulated source", "anchors", number, len(ANCHORS), len(anchors), whole=True)
-        return cls(seed=seed, count=count, rate_hz=rate_hz, anchors=anchors[:number])
+        radio = Receiver(channel=channel)
+        return cls(seed=seed, count=count, rate_hz=rate_hz, anchors=anchors[:number], radio=radio)
 
     def _batches(self) -> Iterator[tuple[TwrBatch, np.random.Generator]]:
         pairs = self._tags * len(self._anchors)
@@ -239,24 +242,27 @@ class SimulatedBuildings(Simulated):
     Args:
         seed: 0 to 2^32 - 1.
         placements: 1 to 10^7. exchanges: 1 to 1000 for each.
+        channel: UWB channel.
 
     Raises:
         ParameterError: an argument is out of its range.
     """
 
-    def __init__(self, *, seed: int = 1, placements: int = 20_000, exchanges: int = 1) -> None:
+    def __init__(
+        self, seed: int = 1, placements: int = 20_000, exchanges: int = 1, channel: Channel = CHANNEL_2
+    ) -> None:
         check_seed(seed)
         check_range("simulated buildings", "placements", placements, 1, 10**7, whole=True)
         check_range("simulated buildings", "exchanges", exchanges, 1, 1000, whole=True)
-        count = placements * exchanges
-        super().__init__(f"simulated buildings, seed {seed}", PLACEMENTS_RATE_HZ, BUILDINGS_RADIO, count)
+        count, radio = placements * exchanges, replace(BUILDINGS_RADIO, channel=channel)
+        super().__init__(f"simulated buildings, seed {seed}", PLACEMENTS_RATE_HZ, radio, count)
         self._seed = seed
         self._exchanges = exchanges
 
     def _batches(self) -> Iterator[tuple[TwrBatch, np.random.Generator]]:
         together = max(1, BATCH // self._exchanges)
         for number in range(-(-self._count // (PLACEMENTS * self._exchanges))):
-            block, rng = block_of(self._seed, number)
+            block, rng = block_of(self._seed, number, radio=self._radio)
             for first in range(0, PLACEMENTS, together):
                 rows = np.arange(first, min(first + together, PLACEMENTS))
                 names = [block.configuration(self._seed, number, k) for k in rows.tolist()]

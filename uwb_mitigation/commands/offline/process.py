@@ -29,7 +29,13 @@ from uwb_mitigation.types.measurement import RangeMeasurement, Status, reason
 from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets
 from uwb_mitigation.types.ros import schemas
 from uwb_mitigation.types.ros.codec import RangeBatch, decode_range, encode_corrected
-from uwb_mitigation.types.ros.topics import ANCHORS, RANGE_CIR_TYPE, RANGE_CORRECTED, RANGE_RAW
+from uwb_mitigation.types.ros.topics import (
+    ANCHORS,
+    RANGE_CIR_TYPE,
+    RANGE_CORRECTED,
+    RANGE_CORRECTED_TYPE,
+    RANGE_RAW,
+)
 
 BATCH = 256
 """Messages per batch: large enough for vectorisation, small enough for the network's inputs to fit into the cache."""
@@ -146,11 +152,7 @@ def process_bag(job: Job, report: Report | None = None) -> Outcome:
                 report(outcome.messages, bag.message_count)
         if outcome.error is not None and outcome.messages == 0:
             raise outcome.error
-        if RANGE_RAW not in bag.topics:
-            topics = ", ".join(sorted(bag.topics)) or "no topic"
-            raise RecordingError(
-                f"no topic {RANGE_RAW}", where=str(job.source), valid=f"the bag contains: {topics}"
-            )
+        bag.require(RANGE_RAW)
     outcome.seconds = time.perf_counter() - started
     outcome.ranges = outcome.statuses.total()
     outcome.skipped.update(bag.warnings)
@@ -164,7 +166,7 @@ class _Corrector:
         self._outcome, self._mitigation, self._out = outcome, mitigation, out
         # The bag keeps references to its channels, so that an id() identifies one channel of one file.
         self._channels: dict[int, int] = {}
-        self._corrected = out.corrected_channel()
+        self._corrected = out.channel(RANGE_CORRECTED, RANGE_CORRECTED_TYPE)
 
     def write(self, batch: list[RawMessage]) -> None:
         """Write the messages of a batch, and after each raw range its corrected range."""

@@ -19,13 +19,11 @@ from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard, Session
 from uwb_mitigation.mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.mitigation.model.ood import OodBands, check_float32
 from uwb_mitigation.mitigation.model.requantisation import Sum
-from uwb_mitigation.mitigation.preprocessing import Scaling
 
 MODEL_HEADER = "uwb_model.h"
 GOLDEN_VECTORS = 8
 
 _COLUMNS = 100
-_SCALINGS = {Scaling.MAX: "UWB_SCALE_MAX", Scaling.PREAMBLE: "UWB_SCALE_PREAMBLE"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,7 +160,7 @@ def _model(network: PackedNetwork, card: ModelCard, model_id: int) -> str:
     values = [
         f"0x{model_id:08x}u",
         f"{network.samples}u",
-        _SCALINGS[card.preprocessing.scaling],
+        f"UWB_SCALE_{card.preprocessing.scaling.name}",
         format_number(network.input_scale),
         f"{network.first_kernel}u",
         f"{len(network.modules)}u",

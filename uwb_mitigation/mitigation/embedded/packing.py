@@ -20,7 +20,7 @@ from uwb_mitigation.mitigation.model.requantisation import (
     solve_requantisation,
     solve_sum,
 )
-from uwb_mitigation.mitigation.model.weights import Int8Weights, layer_inputs
+from uwb_mitigation.mitigation.model.weights import Int8Weights, inputs_of
 
 FILTERS = 16
 FIRST_KERNELS = (3, 5)
@@ -97,7 +97,7 @@ def pack(weights: Int8Weights) -> PackedNetwork:
         samples=shape.samples,
         input_scale=scale["input"],
         head_bias=_head_bias(weights.weight[HEAD].T, weights.bias[HEAD]),
-        head_scale=np.float32(scale[layer_inputs(shape)[HEAD]] * weights.weight_scale[HEAD][0]),
+        head_scale=np.float32(scale[inputs_of(shape)[HEAD][0]] * weights.weight_scale[HEAD][0]),
         **layers,
     )
 
@@ -183,7 +183,7 @@ def _packed_layers(weights: Int8Weights, shape: Mlp) -> dict[str, Any]:
 def _channels(weights: Int8Weights, name: str) -> Channels:
     """Return the requantisation of a layer; raises ModelError if it has no exact integer form."""
     scale, bias = weights.activation_scale, weights.bias[name]
-    read = layer_inputs(weights.architecture)[name]
+    (read,) = inputs_of(weights.architecture)[name]
     scales = requantisation_scale(scale[read], weights.weight_scale[name], scale[name])
     low, high = accumulator_range(weights.weight[name], bias)
     constants = np.empty((3, len(bias)), np.int32)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TypeAlias
 
 from uwb_mitigation.errors import ParameterError, check_range
@@ -30,13 +33,77 @@ class Convolution:
     length: int
 
     @property
+    def output_length(self) -> int:
+        """Length of its output in samples."""
+        return -(-self.length // self.stride)
+
+    @property
     def padding(self) -> tuple[int, int]:
-        """Number of zeros before and after the input."""
-        return same_padding(self.length, self.kernel, self.stride)
+        """Number of zeros before and after the input for 'same' padding (see `Remnet`)."""
+        total = max((self.output_length - 1) * self.stride + self.kernel - self.length, 0)
+        return total // 2, total - total // 2
+
+    @property
+    def weight_shape(self) -> tuple[int, ...]:
+        """Shape of its weights."""
+        return self.filters, self.inputs, self.kernel
 
 
 @dataclass(frozen=True, slots=True)
-class Remnet:
+class Dense:
+    """One dense layer of the MLP, followed by a ReLU."""
+
+    name: str
+    inputs: int
+    outputs: int
+    output_length = 1
+
+    @property
+    def weight_shape(self) -> tuple[int, ...]:
+        """Shape of its weights."""
+        return self.outputs, self.inputs
+
+
+class _Network(ABC):
+    """Layers that are followed by the head."""
+
+    __slots__ = ()
+
+    @property
+    def kind(self) -> str:
+        """`remnet` or `mlp`."""
+        return type(self).__name__.lower()
+
+    @property
+    @abstractmethod
+    def layers(self) -> tuple[Convolution, ...] | tuple[Dense, ...]:
+        """Every layer before the head, in the order of evaluation."""
+
+    @property
+    @abstractmethod
+    def features(self) -> int:
+        """Inputs of the head."""
+
+    @property
+    def weight_shapes(self) -> dict[str, tuple[int, ...]]:
+        """{layer: shape of its weights}; outputs first, except for the head."""
+        return {layer.name: layer.weight_shape for layer in self.layers} | {HEAD: (self.features, 1)}
+
+    @property
+    def parameters(self) -> int:
+        """Trainable parameters (paper, Table 1)."""
+        biases = sum(layer.weight_shape[0] for layer in self.layers) + 1
+        return sum(map(math.prod, self.weight_shapes.values())) + biases
+
+    @property
+    def multiply_accumulates(self) -> int:
+        """Multiply-accumulates of one inference, including padding."""
+        products = (math.prod(layer.weight_shape) * layer.output_length for layer in self.layers)
+        return sum(products) + self.features
+
+
+@dataclass(frozen=True, slots=True)
+class Remnet(_Network):
     """REMNet without attention: conv k0; N residual reduction modules; flatten; dense.
 
     Each module computes `r = relu(conv_kn(x)) + x; out = relu(conv_kn,s2(r)) + relu(conv_k1,s2(r))`
@@ -73,7 +140,7 @@ class Remnet:
         return tuple(lengths)
 
     @property
-    def convolutions(self) -> tuple[Convolution, ...]:
+    def layers(self) -> tuple[Convolution, ...]:
         """Every convolution in the order of evaluation: first, then residual, reduce and skip of each module."""
         f, k = self.filters, self.kernel
         layers = [Convolution("first", 1, f, self.first_kernel, 1, self.samples)]
@@ -90,30 +157,9 @@ class Remnet:
         """Inputs of the head."""
         return self.lengths[-1] * self.filters
 
-    @property
-    def parameters(self) -> int:
-        """Trainable parameters (paper, Table 1)."""
-        in_convolutions = sum((c.inputs * c.kernel + 1) * c.filters for c in self.convolutions)
-        return in_convolutions + self.features + 1
-
-    @property
-    def multiply_accumulates(self) -> int:
-        """Multiply-accumulates of one inference, including padding."""
-        outputs = ((c, c.filters * -(-c.length // c.stride)) for c in self.convolutions)
-        return sum(c.inputs * c.kernel * count for c, count in outputs) + self.features
-
 
 @dataclass(frozen=True, slots=True)
-class Dense:
-    """One dense layer of the MLP, followed by a ReLU."""
-
-    name: str
-    inputs: int
-    outputs: int
-
-
-@dataclass(frozen=True, slots=True)
-class Mlp:
+class Mlp(_Network):
     """The paper's baseline: dense layers with ReLU on the window, then the head.
 
     The paper reports 54,401 parameters, but no layer sizes; the default has exactly this number.
@@ -135,31 +181,12 @@ class Mlp:
     def layers(self) -> tuple[Dense, ...]:
         """Every dense layer before the head, in the order of evaluation: `dense1`, `dense2`, ..."""
         sizes = (self.samples, *self.hidden)
-        return tuple(
-            Dense(f"dense{number}", inputs, outputs)
-            for number, (inputs, outputs) in enumerate(zip(sizes, self.hidden, strict=False), start=1)
-        )
+        return tuple(Dense(f"dense{n}", *size) for n, size in enumerate(pairwise(sizes), start=1))
 
     @property
     def features(self) -> int:
         """Inputs of the head."""
         return self.hidden[-1]
 
-    @property
-    def parameters(self) -> int:
-        """Trainable parameters (paper, Table 1)."""
-        return sum((layer.inputs + 1) * layer.outputs for layer in self.layers) + self.features + 1
-
-    @property
-    def multiply_accumulates(self) -> int:
-        """Multiply-accumulates of one inference."""
-        return sum(layer.inputs * layer.outputs for layer in self.layers) + self.features
-
 
 Architecture: TypeAlias = Remnet | Mlp
-
-
-def same_padding(length: int, kernel: int, stride: int) -> tuple[int, int]:
-    """Return the number of zeros before and after for 'same' padding (see `Remnet`)."""
-    total = max((-(-length // stride) - 1) * stride + kernel - length, 0)
-    return total // 2, total - total // 2

@@ -189,10 +189,10 @@ def _unpickled(model: bytes, path: Path) -> Bundle:
 
 
 class Session:
-    """Runs the network of a bundle."""
+    """Runs the network of a bundle, or a serialised ONNX graph of this package."""
 
-    def __init__(self, bundle: Bundle) -> None:
-        self._session = bundle.session
+    def __init__(self, model: Bundle | bytes) -> None:
+        self._session = model.session if isinstance(model, Bundle) else _session(model, "")
         (source,), (result,) = self._session.get_inputs(), self._session.get_outputs()
         self._input, self._outputs = source.name, [result.name]
 
@@ -309,8 +309,7 @@ def build_bundle(path: Path, graph: bytes, card: ModelCard) -> tuple[Bundle, byt
         "model_id": _BLANK.decode(),
         "radios": [radio.name for radio in card.radios],
         "segments": [segment.name for segment in card.segments],
-        "architecture": asdict(card.architecture)
-        | {"kind": "mlp" if isinstance(card.architecture, Mlp) else "remnet"},
+        "architecture": asdict(card.architecture) | {"kind": card.architecture.kind},
         "preprocessing": {"samples": card.preprocessing.samples, "scaling": card.preprocessing.scaling.value},
     }
     if not card.channels:

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ModelError
 from uwb_mitigation.mitigation.model import graph
-from uwb_mitigation.mitigation.model.architecture import HEAD, Convolution, Mlp, Remnet
+from uwb_mitigation.mitigation.model.architecture import HEAD, Remnet
 from uwb_mitigation.mitigation.model.bundle import Bundle
-from uwb_mitigation.mitigation.model.weights import (
-    FloatWeights,
-    activation_tensors,
-    layer_inputs,
-    sum_operands,
-)
+from uwb_mitigation.mitigation.model.weights import FloatWeights, evaluate, inputs_of, shaped, weighted_sums
 
 CHUNK = 256
 """Batch size, which limits the memory."""
@@ -28,37 +24,19 @@ def activations(weights: FloatWeights, inputs: NDArray[np.float32]) -> dict[str,
     The result is {tensor: (n, channels, length)}; for an MLP, {tensor: (n, outputs)}.
     """
     architecture = weights.architecture
-    if isinstance(architecture, Mlp):
-        dense = {"input": inputs}
-        for layer, read in layer_inputs(architecture).items():
-            if layer != HEAD:
-                sums = dense[read] @ weights.weight[layer].T + weights.bias[layer]
-                dense[layer] = np.maximum(sums, np.float32(0))
-        return dense
-    layers = {layer.name: layer for layer in architecture.convolutions}
-    reads = layer_inputs(architecture)
-    values = {"input": inputs[:, None, :]}
-    for tensor in activation_tensors(architecture)[1:]:
-        if tensor in reads:
-            values[tensor] = _convolve(weights, layers[tensor], values[reads[tensor]])
-        else:
-            first, second = sum_operands(tensor)
-            values[tensor] = values[first] + values[second]
-    return values
+    layers = {layer.name: layer for layer in architecture.layers}
 
+    def rectified(name: str, values: NDArray[np.float32]) -> Any:
+        sums = weighted_sums(layers[name], values, weights.weight[name], weights.bias[name])
+        return np.maximum(sums, np.float32(0))
 
-def _convolve(weights: FloatWeights, layer: Convolution, values: NDArray[np.float32]) -> NDArray[np.float32]:
-    padded = np.pad(values, ((0, 0), (0, 0), layer.padding))
-    windows = np.lib.stride_tricks.sliding_window_view(padded, layer.kernel, axis=2)
-    windows = windows[:, :, :: layer.stride]
-    sums = np.einsum("ncpk,fck->nfp", windows, weights.weight[layer.name], optimize=True)
-    activation: NDArray[np.float32] = np.maximum(sums + weights.bias[layer.name][:, None], np.float32(0))
-    return activation
+    first = shaped(architecture, inputs)
+    return evaluate(architecture, first, rectified, lambda name, one, other: one + other)
 
 
 def predict_m(weights: FloatWeights, inputs: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the outputs of the float network, (n,), m, for inputs of shape (n, K)."""
-    last = activation_tensors(weights.architecture)[-1]
+    (last,) = inputs_of(weights.architecture)[HEAD]
     outputs = []
     for start in range(0, len(inputs), CHUNK):
         flat = activations(weights, inputs[start : start + CHUNK])[last]
@@ -77,13 +55,13 @@ def float_network(source: Bundle) -> FloatWeights:
     if not source.quantised:
         return graph.float_weights(source.model, source.architecture)
     integers = graph.int8_weights(source.model, source.architecture)
-    reads = layer_inputs(source.architecture)
+    inputs = inputs_of(source.architecture)
     weight, bias = {}, {}
     for layer, values in integers.weight.items():
         scale = integers.weight_scale[layer]
         shaped = scale if layer == HEAD else scale[:, None, None]
         weight[layer] = (values * shaped).astype(np.float32)
-        unit = integers.activation_scale[reads[layer]] * scale
+        unit = integers.activation_scale[inputs[layer][0]] * scale
         bias[layer] = (integers.bias[layer] * unit).astype(np.float32)
     return FloatWeights(source.architecture, weight, bias)
 

@@ -18,15 +18,8 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
 from uwb_mitigation.errors import ModelError
-from uwb_mitigation.mitigation.model.architecture import HEAD, Architecture, Mlp, Remnet
-from uwb_mitigation.mitigation.model.weights import (
-    FloatWeights,
-    Int8Weights,
-    activation_tensors,
-    layer_inputs,
-    sum_operands,
-    weight_shapes,
-)
+from uwb_mitigation.mitigation.model.architecture import HEAD, Architecture, Convolution, Mlp, Remnet
+from uwb_mitigation.mitigation.model.weights import FloatWeights, Int8Weights, activation_tensors, inputs_of
 
 INPUT = "cir"
 OUTPUT = "error"
@@ -84,7 +77,7 @@ def float_model(weights: FloatWeights) -> bytes:
         ]
 
     _write(graph, weights.architecture, parameters, lambda tensor, value: value)
-    return graph.model(weights.architecture, _name(weights.architecture))
+    return graph.model(weights.architecture, weights.architecture.kind)
 
 
 def int8_model(weights: Int8Weights) -> bytes:
@@ -93,14 +86,17 @@ def int8_model(weights: Int8Weights) -> bytes:
     zero = graph.constant("zero_uint8", np.uint8(0))
     for tensor in activation_tensors(weights.architecture):
         graph.constant(f"{tensor}.scale", np.float32(weights.activation_scale[tensor]))
-    reads = layer_inputs(weights.architecture)
+    input_scale = {
+        layer: np.float32(weights.activation_scale[inputs[0]])
+        for layer, inputs in inputs_of(weights.architecture).items()
+    }
     if isinstance(weights.architecture, Remnet):
         # With the same scale before and after Flatten, the runtime flattens the integers.
-        graph.constant("flat.scale", np.float32(weights.activation_scale[reads[HEAD]]))
+        graph.constant("flat.scale", input_scale[HEAD])
 
     def parameters(layer: str) -> list[str]:
         scale = weights.weight_scale[layer]
-        accumulator = np.float32(weights.activation_scale[reads[layer]]) * scale
+        accumulator = input_scale[layer] * scale
         # The head has one scale for the tensor; other layers have one for each filter.
         if layer == HEAD:
             scale, accumulator = scale[0], accumulator[0]
@@ -138,7 +134,7 @@ def int8_model(weights: Int8Weights) -> bytes:
         return graph.node("DequantizeLinear", [f"{tensor}.quantised", *pair], f"{tensor}.dequantised{reader}")
 
     _write(graph, weights.architecture, parameters, quantised)
-    return graph.model(weights.architecture, f"{_name(weights.architecture)}_int8")
+    return graph.model(weights.architecture, f"{weights.architecture.kind}_int8")
 
 
 def float_weights(model: bytes, architecture: Architecture) -> FloatWeights:
@@ -148,7 +144,7 @@ def float_weights(model: bytes, architecture: Architecture) -> FloatWeights:
         ModelError: an initializer is absent or of another shape or type.
     """
     constants = _constants(model)
-    layers = list(weight_shapes(architecture))
+    layers = list(architecture.weight_shapes)
     return FloatWeights(
         architecture,
         {name: _as_written(name, _take(constants, f"{name}.weight", np.float32)) for name in layers},
@@ -163,7 +159,7 @@ def int8_weights(model: bytes, architecture: Architecture) -> Int8Weights:
         ModelError: an initializer is absent or of another shape or type.
     """
     constants = _constants(model)
-    layers = list(weight_shapes(architecture))
+    layers = list(architecture.weight_shapes)
     return Int8Weights(
         architecture,
         {name: _as_written(name, _take(constants, f"{name}.weight", np.int8)) for name in layers},
@@ -192,10 +188,6 @@ def _take(constants: dict[str, NDArray[np.generic]], name: str, kind: type[Numbe
     return array.astype(kind, copy=False)
 
 
-def _name(architecture: Architecture) -> str:
-    return "mlp" if isinstance(architecture, Mlp) else "remnet"
-
-
 def _as_written(layer: str, weight: NDArray[Number]) -> NDArray[Number]:
     """Convert weights to the layout of the graph, or back: dense layers are transposed, inputs first."""
     return np.ascontiguousarray(weight.T) if layer != HEAD and weight.ndim == 2 else weight
@@ -209,22 +201,25 @@ def _write(
 ) -> None:
     """Write the nodes of a network. `read(tensor, value)` returns the name of the value that readers of `tensor` use."""
     is_mlp = isinstance(architecture, Mlp)
-    layers = (
-        {} if isinstance(architecture, Mlp) else {layer.name: layer for layer in architecture.convolutions}
-    )
-    reads = layer_inputs(architecture)
+    layers = {layer.name: layer for layer in architecture.layers}
     values = {"input": graph.node("Flatten", [INPUT], "flat", axis=1) if is_mlp else INPUT}
-    for tensor in activation_tensors(architecture)[1:]:
-        if tensor not in reads:
-            graph.node("Add", [read(name, name) for name in sum_operands(tensor)], tensor)
-            continue
-        source, shape = reads[tensor], {}
-        if layer := layers.get(tensor):
-            shape = {"kernel_shape": [layer.kernel], "strides": [layer.stride], "pads": list(layer.padding)}
-        inputs = [read(source, values.get(source, source)), *parameters(tensor)]
-        sums = graph.node("Gemm" if is_mlp else "Conv", inputs, f"{tensor}.accumulated", **shape)
-        graph.node("Relu", [sums], tensor)
-    last = read(reads[HEAD], reads[HEAD])
+    for tensor, names in inputs_of(architecture).items():
+        operands = [read(name, values.get(name, name)) for name in names]
+        if tensor == HEAD:
+            (last,) = operands
+        elif len(operands) == 2:
+            graph.node("Add", operands, tensor)
+        else:
+            shape, layer = {}, layers[tensor]
+            if isinstance(layer, Convolution):
+                shape = {
+                    "kernel_shape": [layer.kernel],
+                    "strides": [layer.stride],
+                    "pads": list(layer.padding),
+                }
+            inputs = [*operands, *parameters(tensor)]
+            sums = graph.node("Gemm" if is_mlp else "Conv", inputs, f"{tensor}.accumulated", **shape)
+            graph.node("Relu", [sums], tensor)
     if not is_mlp:
         last = read("flat", graph.node("Flatten", [last], "flat", axis=1))
     graph.node("Gemm", [last, *parameters(HEAD)], OUTPUT)

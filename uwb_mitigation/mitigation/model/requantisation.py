@@ -27,13 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ModelError
-from uwb_mitigation.mitigation.model.architecture import HEAD
-from uwb_mitigation.mitigation.model.weights import (
-    Int8Weights,
-    activation_tensors,
-    layer_inputs,
-    sum_operands,
-)
+from uwb_mitigation.mitigation.model.weights import Int8Weights, inputs_of
 
 BIASES = range(3 << 18, 5 << 18)
 """Biases of the firmware's accumulators. They keep the three packed sums of `uwb_conv_residual.S` positive."""
@@ -278,20 +272,19 @@ def nudge(weights: Int8Weights) -> Int8Weights:
     """
     activation = dict(weights.activation_scale)
     weight_scale = dict(weights.weight_scale)
-    reads = layer_inputs(weights.architecture)
-    for tensor in activation_tensors(weights.architecture)[1:]:
-        if tensor not in reads:
-            first, second = sum_operands(tensor)
-            activation[tensor] = nudge_sum_scale(activation[first], activation[second], activation[tensor])
-    for layer, read in reads.items():
-        if layer != HEAD:
-            low, high = accumulator_range(weights.weight[layer], weights.bias[layer])
-            try:
-                weight_scale[layer] = nudge_weight_scale(
-                    activation[read], weight_scale[layer], activation[layer], low, high
-                )
-            except ModelError as error:
-                raise ModelError(error.what, where=layer, valid=error.valid) from error
+    inputs = inputs_of(weights.architecture)
+    for tensor, operands in inputs.items():
+        if len(operands) == 2:
+            first, second = (activation[operand] for operand in operands)
+            activation[tensor] = nudge_sum_scale(first, second, activation[tensor])
+    for layer in (layer.name for layer in weights.architecture.layers):
+        low, high = accumulator_range(weights.weight[layer], weights.bias[layer])
+        try:
+            weight_scale[layer] = nudge_weight_scale(
+                activation[inputs[layer][0]], weight_scale[layer], activation[layer], low, high
+            )
+        except ModelError as error:
+            raise ModelError(error.what, where=layer, valid=error.valid) from error
     return replace(weights, weight_scale=weight_scale, activation_scale=activation)
 
 

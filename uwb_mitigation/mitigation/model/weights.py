@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ModelError
-from uwb_mitigation.mitigation.model.architecture import HEAD, Architecture, Mlp
+from uwb_mitigation.mitigation.model.architecture import HEAD, Architecture, Convolution, Dense, Mlp
+
+Number = TypeVar("Number", bound=np.generic)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,59 +63,76 @@ class Int8Weights:
                 raise ModelError(f"scale {scale} of {tensor}", valid="a finite positive scale")
 
 
-def activation_tensors(architecture: Architecture) -> tuple[str, ...]:
-    """Return every tensor that has a scale in int8, in the order of evaluation.
+def inputs_of(architecture: Architecture) -> dict[str, tuple[str, ...]]:
+    """Return {tensor: the tensors that it is computed from}, in the order of evaluation.
 
-    The first is `input`. REMNet: `first`, then for each module its convolutions, `moduleN.sum` (sum of the residual)
-    and `moduleN` (its output). MLP: its layers. The output of a layer has the name of the layer; a tensor that is not
-    the output of a layer is the sum of its `sum_operands`.
+    The output of a layer has the name of the layer, and one input; other tensors are sums of two. The first input is `input`.
+    REMNet: `first`, then for each module `moduleN.residual`, `moduleN.sum` (sum of the residual), `moduleN.reduce`,
+    `moduleN.skip` and `moduleN` (its output). MLP: its layers. The last one is the output of the head.
     """
     if isinstance(architecture, Mlp):
-        return ("input", *(layer.name for layer in architecture.layers))
-    names = ["input", "first"]
-    for module in range(1, architecture.modules + 1):
-        prefix = f"module{module}"
-        names += [f"{prefix}.{parameter}" for parameter in ("residual", "sum", "reduce", "skip")]
-        names.append(prefix)
-    return tuple(names)
-
-
-def layer_inputs(architecture: Architecture) -> dict[str, str]:
-    """Return {layer: its input tensor}, in the order of evaluation."""
-    if isinstance(architecture, Mlp):
-        tensors = activation_tensors(architecture)
-        return dict(zip((*tensors[1:], HEAD), tensors, strict=True))
-    reads = {"first": "input"}
+        names = ["input", *(layer.name for layer in architecture.layers), HEAD]
+        return {name: (read,) for read, name in pairwise(names)}
+    inputs: dict[str, tuple[str, ...]] = {"first": ("input",)}
     tensor = "first"
-    for module in range(1, architecture.modules + 1):
-        prefix = f"module{module}"
-        reads[f"{prefix}.residual"] = tensor
-        reads[f"{prefix}.reduce"] = reads[f"{prefix}.skip"] = f"{prefix}.sum"
-        tensor = prefix
-    reads[HEAD] = tensor
-    return reads
+    for number in range(1, architecture.modules + 1):
+        module = f"module{number}"
+        inputs[f"{module}.residual"] = (tensor,)
+        inputs[f"{module}.sum"] = f"{module}.residual", tensor
+        inputs[f"{module}.reduce"] = inputs[f"{module}.skip"] = (f"{module}.sum",)
+        inputs[module] = f"{module}.reduce", f"{module}.skip"
+        tensor = module
+    return inputs | {HEAD: (tensor,)}
 
 
-def sum_operands(tensor: str) -> tuple[str, str]:
-    """Return the two operands of `moduleN.sum` or `moduleN`."""
-    module, _, parameter = tensor.partition(".")
-    if not parameter:
-        return f"{module}.reduce", f"{module}.skip"
-    number = int(module.removeprefix("module"))
-    return f"{module}.residual", "first" if number == 1 else f"module{number - 1}"
+def activation_tensors(architecture: Architecture) -> tuple[str, ...]:
+    """Return every tensor that has a scale in int8, in the order of evaluation: `input`, and all except for the head's."""
+    return ("input", *inputs_of(architecture))[:-1]
 
 
-def weight_shapes(architecture: Architecture) -> dict[str, tuple[int, ...]]:
-    """Return {layer: shape of its weights}; outputs first, except for the head."""
-    shapes: dict[str, tuple[int, ...]]
-    if isinstance(architecture, Mlp):
-        shapes = {layer.name: (layer.outputs, layer.inputs) for layer in architecture.layers}
-    else:
-        shapes = {
-            layer.name: (layer.filters, layer.inputs, layer.kernel) for layer in architecture.convolutions
-        }
-    shapes[HEAD] = (architecture.features, 1)
-    return shapes
+def weighted_sums(
+    layer: Convolution | Dense, values: NDArray[Any], weight: NDArray[Any], bias: NDArray[Any]
+) -> Any:
+    """Return the output of a layer before its ReLU: (n, filters, length out); of a dense layer (n, outputs).
+
+    Args:
+        layer: the layer.
+        values: its input, (n, inputs, length) or (n, inputs).
+        weight: of the layer, in the type of the result.
+        bias: of the layer.
+    """
+    if isinstance(layer, Dense):
+        return values @ weight.T + bias
+    padded = np.pad(values, ((0, 0), (0, 0), layer.padding))
+    windows = np.lib.stride_tricks.sliding_window_view(padded, layer.kernel, axis=2)[:, :, :: layer.stride]
+    return np.einsum("ncpk,fck->nfp", windows, weight, optimize=True) + bias[:, None]
+
+
+def shaped(architecture: Architecture, inputs: NDArray[Number]) -> NDArray[Number]:
+    """Return the input of the first layer for windows (n, K): (n, 1, K); of a dense layer (n, K)."""
+    return inputs if isinstance(architecture, Mlp) else inputs[:, None, :]
+
+
+def evaluate(
+    architecture: Architecture,
+    inputs: Any,
+    layer: Callable[[str, Any], Any],
+    add: Callable[[str, Any, Any], Any],
+) -> dict[str, Any]:
+    """Return all activations of a network, {tensor: activation}.
+
+    Args:
+        architecture: the network.
+        inputs: of the first layer.
+        layer: returns the output of a layer for its input; gets the name of the layer.
+        add: returns the sum of two tensors; gets the name of the sum.
+    """
+    values = {"input": inputs}
+    for tensor, names in inputs_of(architecture).items():
+        if tensor != HEAD:
+            operands = [values[name] for name in names]
+            values[tensor] = layer(tensor, *operands) if len(operands) == 1 else add(tensor, *operands)
+    return values
 
 
 def _check_shapes(
@@ -119,7 +140,7 @@ def _check_shapes(
     weight: Mapping[str, NDArray[np.generic]],
     bias: Mapping[str, NDArray[np.generic]],
 ) -> None:
-    for name, weight_shape in weight_shapes(architecture).items():
+    for name, weight_shape in architecture.weight_shapes.items():
         bias_shape = (1,) if name == HEAD else weight_shape[:1]
         for parameter, arrays, shape in (("weight", weight, weight_shape), ("bias", bias, bias_shape)):
             if name not in arrays:

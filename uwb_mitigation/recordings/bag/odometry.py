@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 from pathlib import Path
 from types import SimpleNamespace as Fields
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.recordings.bag.pose_paths import check_topic, decode_messages
-from uwb_mitigation.recordings.bag.reader import BagReader
+from uwb_mitigation.recordings.bag.pose_paths import read_topic, sorted_rows
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.types.ros.poses import header_fields, quaternion, vector, yaw_of
 from uwb_mitigation.types.ros.schemas import serialize
@@ -30,7 +28,7 @@ _UNMEASURED = 1e6
 """Variance of values that wheels do not measure: z, roll and pitch."""
 
 
-def encode_odometry_row(odometry: Odometry, row: int, frame_id: str = ODOM, child: str = BASE_LINK) -> bytes:
+def encode_odometry_row(odometry: Odometry, row: int) -> bytes:
     """Return one row as `nav_msgs/Odometry` in CDR."""
     x, y, yaw = odometry.pose[row].tolist()
     vx, vy, yaw_rate = odometry.twist[row].tolist()
@@ -38,14 +36,14 @@ def encode_odometry_row(odometry: Odometry, row: int, frame_id: str = ODOM, chil
     twist = Fields(linear=vector(vx, vy), angular=vector(z=yaw_rate))
     return serialize(
         ODOMETRY_TYPE,
-        header=header_fields(int(odometry.stamp_ns[row]), frame_id),
-        child_frame_id=child,
+        header=header_fields(int(odometry.stamp_ns[row]), ODOM),
+        child_frame_id=BASE_LINK,
         pose=Fields(pose=pose, covariance=_six(odometry.pose_covariance[row])),
         twist=Fields(twist=twist, covariance=_six(odometry.twist_covariance[row])),
     )
 
 
-def encode_imu_row(imu: Imu, row: int, frame_id: str = BASE_LINK) -> bytes:
+def encode_imu_row(imu: Imu, row: int) -> bytes:
     """Return one row as `sensor_msgs/Imu` in CDR; the acceleration, and an unknown yaw, are marked as not measured."""
     yaw = float(imu.yaw[row])
     orientation, turning, acceleration = np.zeros(9), np.zeros(9), np.zeros(9)
@@ -55,7 +53,7 @@ def encode_imu_row(imu: Imu, row: int, frame_id: str = BASE_LINK) -> bytes:
     turning[[0, 4, 8]] = _UNMEASURED, _UNMEASURED, imu.yaw_rate_variance[row]
     return serialize(
         IMU_TYPE,
-        header=header_fields(int(imu.stamp_ns[row]), frame_id),
+        header=header_fields(int(imu.stamp_ns[row]), BASE_LINK),
         orientation=quaternion(yaw if math.isfinite(yaw) else 0.0),
         orientation_covariance=orientation,
         angular_velocity=vector(z=float(imu.yaw_rate[row])),
@@ -65,12 +63,12 @@ def encode_imu_row(imu: Imu, row: int, frame_id: str = BASE_LINK) -> bytes:
     )
 
 
-def encode_transform_row(odometry: Odometry, row: int, frame_id: str = ODOM, child: str = BASE_LINK) -> bytes:
+def encode_transform_row(odometry: Odometry, row: int) -> bytes:
     """Return the pose of one row as `tf2_msgs/TFMessage` in CDR."""
     x, y, yaw = odometry.pose[row].tolist()
     transform = Fields(
-        header=header_fields(int(odometry.stamp_ns[row]), frame_id),
-        child_frame_id=child,
+        header=header_fields(int(odometry.stamp_ns[row]), ODOM),
+        child_frame_id=BASE_LINK,
         transform=Fields(translation=vector(x, y), rotation=quaternion(yaw)),
     )
     return serialize(TF_TYPE, transforms=[transform])
@@ -101,7 +99,7 @@ def read_odometry(path: Path, topic: str) -> Odometry:
         RecordingError: The bag cannot be read, has no such topic of this type, or it contains no valid message.
     """
     rows: dict[int, NDArray[np.float64]] = {}
-    for decoded in _messages(path, topic, ODOMETRY_TYPE):
+    for decoded in read_topic(path, topic, (ODOMETRY_TYPE,)):
         pose, twist = decoded.pose.pose, decoded.twist.twist
         values = [pose.position.x, pose.position.y, yaw_of(pose.orientation)]
         values += [twist.linear.x, twist.linear.y, twist.angular.z]
@@ -121,7 +119,7 @@ def read_imu(path: Path, topic: str) -> Imu:
         RecordingError: The bag cannot be read, has no such topic of this type, or it contains no valid message.
     """
     rows: dict[int, NDArray[np.float64]] = {}
-    for decoded in _messages(path, topic, IMU_TYPE):
+    for decoded in read_topic(path, topic, (IMU_TYPE,)):
         # The message marks values that are not measured with a -1 in front of their covariance.
         turning, orientation = decoded.angular_velocity_covariance, decoded.orientation_covariance
         if turning[0] == -1.0:
@@ -135,12 +133,6 @@ def read_imu(path: Path, topic: str) -> Imu:
     return Imu(stamp_ns, yaw_rate, yaw_rate_variance, np.where(known_yaw, yaw, np.nan), yaw_variance)
 
 
-def _messages(path: Path, topic: str, kind: str) -> Any:
-    bag = BagReader(path)
-    check_topic(path, bag.topics, topic, (kind,))
-    return decode_messages(bag, [topic], f"{path}, topic {topic}")
-
-
 def _columns(
     rows: dict[int, NDArray[np.float64]], path: Path, topic: str, checked: slice = slice(None)
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -150,8 +142,7 @@ def _columns(
         raise RecordingError(
             "no valid message", where=f"{path}, topic {topic}", valid="finite values and covariances"
         )
-    stamps = sorted(finite)
-    return np.array(stamps, np.int64), np.array([finite[stamp] for stamp in stamps])
+    return sorted_rows(finite)
 
 
 def _six(plane: NDArray[np.float64]) -> NDArray[np.float64]:

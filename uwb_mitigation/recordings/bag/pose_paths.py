@@ -6,11 +6,12 @@ Messages are decoded with the types that the bag itself declares, so that no int
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from uwb_mitigation.errors import RecordingError, did_you_mean
@@ -52,13 +53,16 @@ def read_truth(path: Path, topic: str = topics.ODOMETRY_TRUTH) -> dict[int | Non
         tag = tag_of_frame(getattr(decoded, "child_frame_id", ""))
         if all(map(math.isfinite, row[:3])) and (tag in rows or len(rows) < _MAX_FRAMES):
             rows.setdefault(tag, {}).setdefault(to_ns(decoded.header.stamp), row)
-    return {tag: _true_path(poses) for tag, poses in rows.items()}
+    columns = {tag: sorted_rows(poses) for tag, poses in rows.items()}
+    return {
+        tag: TruePath(stamp_ns, values[:, :3], values[:, 3]) for tag, (stamp_ns, values) in columns.items()
+    }
 
 
-def _true_path(poses: dict[int, tuple[float, ...]]) -> TruePath:
-    stamps = sorted(poses)
-    values = np.array([poses[stamp] for stamp in stamps])
-    return TruePath(np.array(stamps, np.int64), values[:, :3], values[:, 3])
+def sorted_rows(rows: Mapping[int, Any]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return stamps int64 (n,) and values float64 (n, k), in the order of time, of {stamp: k values}."""
+    stamps = sorted(rows)
+    return np.array(stamps, np.int64), np.array([rows[stamp] for stamp in stamps], np.float64)
 
 
 def read_bodies(path: Path, topic: str, frames: tuple[str, str] | None = None) -> dict[str, PosePath]:
@@ -172,12 +176,9 @@ def read_heights(path: Path, topic: str, sd_m: float = 0.1) -> Heights:
     Raises:
         RecordingError: The bag cannot be read, has no such topic, or the topic contains no valid height.
     """
-    bag = BagReader(path)
-    where = f"{path}, topic {topic}"
-    check_topic(path, bag.topics, topic, HEIGHT_TYPES)
     rows: dict[int, tuple[float, float]] = {}
-    for decoded in decode_messages(bag, [topic], where):
-        if bag.topics[topic] == topics.RANGE_SENSOR_TYPE:
+    for decoded in read_topic(path, topic, HEIGHT_TYPES):
+        if hasattr(decoded, "min_range"):
             height, variance = float(decoded.range), float(getattr(decoded, "variance", 0.0))
             valid = decoded.min_range <= height <= decoded.max_range
         else:
@@ -187,10 +188,10 @@ def read_heights(path: Path, topic: str, sd_m: float = 0.1) -> Heights:
             has_variance = math.isfinite(variance) and variance > 0.0
             rows[to_ns(decoded.header.stamp)] = height, variance if has_variance else sd_m**2
     if not rows:
-        raise RecordingError("no valid height", where=where, valid="finite heights within the sensor's range")
-    stamps = sorted(rows)
-    values = np.array([rows[stamp] for stamp in stamps])
-    return Heights(np.array(stamps, np.int64), values[:, 0], values[:, 1])
+        where, valid = f"{path}, topic {topic}", "finite heights within the sensor's range"
+        raise RecordingError("no valid height", where=where, valid=valid)
+    stamp_ns, values = sorted_rows(rows)
+    return Heights(stamp_ns, *values.T)
 
 
 def check_topic(path: Path, recorded: dict[str, str], topic: str, types: tuple[str, ...]) -> None:
@@ -202,6 +203,17 @@ def check_topic(path: Path, recorded: dict[str, str], topic: str, types: tuple[s
     valid = ", ".join(usable) or f"a topic of type {', '.join(types)}; the bag has none"
     suggestion = did_you_mean(topic, [name for name, kind in recorded.items() if kind in types])
     raise RecordingError(what, where=str(path), valid=valid, suggestion=suggestion)
+
+
+def read_topic(path: Path, topic: str, types: tuple[str, ...]) -> Iterator[Any]:
+    """Return the messages of a topic that has one of the types.
+
+    Raises:
+        RecordingError: the bag cannot be read, has no such topic, or its messages cannot be decoded.
+    """
+    bag = BagReader(path)
+    check_topic(path, bag.topics, topic, types)
+    return decode_messages(bag, [topic], f"{path}, topic {topic}")
 
 
 def decode_messages(bag: BagReader, names: list[str], where: str) -> Iterator[Any]:

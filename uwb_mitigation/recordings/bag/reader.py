@@ -11,7 +11,7 @@ import struct
 import zlib
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from io import BytesIO
 from operator import attrgetter
@@ -27,7 +27,7 @@ from mcap.reader import FOOTER_SIZE
 from mcap.stream_reader import MAGIC_SIZE, StreamReader
 from mcap.writer import MCAP0_MAGIC
 
-from uwb_mitigation.errors import DamagedRecordingError, RecordingError
+from uwb_mitigation.errors import DamagedRecordingError, RecordingError, did_you_mean
 from uwb_mitigation.recordings.bag.rosbag2 import bag_files
 from uwb_mitigation.types.ros import schemas
 
@@ -181,7 +181,7 @@ class BagReader:
     """
 
     def __init__(self, path: Path) -> None:
-        self.files = bag_files(path)
+        self.files, self._path = bag_files(path), path
         self._indexes = [_index(file) for file in self.files]
         self.metadata: dict[str, dict[str, str]] = {}
         self.warnings: Counter[str] = Counter()
@@ -211,6 +211,15 @@ class BagReader:
         """Channels of all files; a topic has one for each file and publisher."""
         return [channel for index in self._indexes for channel in index.channels.values()]
 
+    def require(self, topic: str) -> None:
+        """Raise RecordingError if the bag does not have a topic."""
+        if topic not in self.topics:
+            listed = ", ".join(f"{name} ({kind})" for name, kind in sorted(self.topics.items()))
+            valid, suggestion = f"the bag contains: {listed or 'no topic'}", did_you_mean(topic, self.topics)
+            raise RecordingError(
+                f"no topic {topic}", where=str(self._path), valid=valid, suggestion=suggestion
+            )
+
     def messages(self, topics: Collection[str] | None = None, start_ns: int = -1) -> Iterator[RawMessage]:
         """Yield the messages of `topics` (None: all) whose log time is not before `start_ns`.
 
@@ -230,6 +239,21 @@ class BagReader:
                             yield message
             except OSError as error:  # noqa: PERF203 - once a file
                 raise RecordingError(f"cannot be read: {error.strerror}", where=str(path)) from error
+
+    def checked_messages(self, types: Mapping[str, str]) -> Iterator[RawMessage]:
+        """Yield the messages of topics, {topic: type}, and check their channels; empty: any type.
+
+        Raises:
+            RecordingError: see `messages` and `check_channel`.
+        """
+        checked: set[int] = set()
+        for message in self.messages(types):
+            # The reader keeps references to its channels, so that an id() identifies one channel of one file.
+            if id(message.channel) not in checked:
+                if expected := types[message.channel.topic]:
+                    check_channel(message.channel, expected, self._path)
+                checked.add(id(message.channel))
+            yield message
 
     def _read_in_time_order(
         self, file: _BoundedFile, index: _FileIndex, topics: Collection[str] | None, start_ns: int

@@ -135,7 +135,7 @@ class BagWriter:
         Raises:
             RecordingError: the time is before the epoch, or the bag cannot be written.
         """
-        self.write_serialized(self._own_channel(topic, type_name), data, stamp_ns, stamp_ns, sequence)
+        self.write_serialized(self.channel(topic, type_name), data, stamp_ns, stamp_ns, sequence)
 
     def copy_channel(self, channel: Channel) -> int:
         """Register a channel of another bag; return its number.
@@ -148,14 +148,10 @@ class BagWriter:
         }
         return self._add_channel(replace(channel, metadata=metadata))
 
-    def corrected_channel(self) -> int:
-        """Register `/uwb/range_corrected`, for serialised messages; return its number."""
-        return self._own_channel(topics.RANGE_CORRECTED, topics.RANGE_CORRECTED_TYPE)
-
     def write_serialized(
         self, channel: int, data: bytes, log_time_ns: int, publish_time_ns: int, sequence: int = 0
     ) -> None:
-        """Write the bytes of a message unchanged to a channel of `copy_channel` or `corrected_channel`.
+        """Write the bytes of a message unchanged to a channel of `copy_channel` or `channel`.
 
         Raises:
             RecordingError: a time is negative, or the bag cannot be written.
@@ -186,7 +182,8 @@ class BagWriter:
             self._discard()
             raise
 
-    def _own_channel(self, topic: str, type_name: str) -> int:
+    def channel(self, topic: str, type_name: str) -> int:
+        """Register a topic of a standard type; return its number."""
         number = self._own_channels.get(topic)
         if number is None:
             schema = Schema(type_name, SchemaEncoding.ROS2, schemas.definition(type_name).encode())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from itertools import islice
 from typing import Any, NamedTuple
 
@@ -27,11 +27,6 @@ from uwb_mitigation.types.measurement import (
 )
 
 _BATCH = 256
-
-_COLUMNS = (
-    *("inputs", "rx_power_dbm", "first_path_power_dbm", "range_m", "error_m", "configurations", "labels"),
-    *("headers", "tags", "anchors", "early_path_m"),
-)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,22 +77,21 @@ class Dataset:
 
     def rows(self, selected: NDArray[np.intp] | NDArray[np.bool_]) -> Dataset:
         """Return a dataset with these rows."""
-        columns = {name: getattr(self, name) for name in _COLUMNS}
-        selected_columns: dict[str, Any] = {
-            name: None if values is None else values[selected] for name, values in columns.items()
-        }
-        return replace(self, skipped={}, **selected_columns)
+        columns: dict[str, Any] = {name: values[selected] for name, values in self._columns().items()}
+        return replace(self, skipped={}, **columns)
 
     @classmethod
     def joined(cls, datasets: Sequence[Dataset]) -> Dataset:
         """Concatenate parts with the same preprocessing; columns that a part does not have are left out."""
-        values = {name: [getattr(dataset, name) for dataset in datasets] for name in _COLUMNS}
-        columns: dict[str, Any] = {
-            name: np.concatenate(arrays)
-            for name, arrays in values.items()
-            if all(array is not None for array in arrays)
-        }
+        parts = [dataset._columns() for dataset in datasets]
+        names = [name for name in parts[0] if all(name in part for part in parts)]
+        columns: dict[str, Any] = {name: np.concatenate([part[name] for part in parts]) for name in names}
         return cls(datasets[0].preprocessing, **columns)
+
+    def _columns(self) -> dict[str, NDArray[Any]]:
+        """Return the columns that the dataset has."""
+        values = {column.name: getattr(self, column.name) for column in fields(self)}
+        return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
 
     def with_early_paths(self, predicted_m: NDArray[np.floating]) -> NDArray[np.floating]:
         """Return the output of a network, (n,), m, with missed direct paths in place of it."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.mitigation.model import graph
 from uwb_mitigation.mitigation.model.architecture import Remnet
-from uwb_mitigation.mitigation.model.bundle import Bundle, session_options
+from uwb_mitigation.mitigation.model.bundle import Bundle, Session
 from uwb_mitigation.mitigation.model.floating import float_network
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.mitigation.model.weights import FloatWeights
@@ -106,16 +106,9 @@ def linear_bias_m(linear_bias: LinearBiasModel, data: Dataset) -> NDArray[np.flo
 
 def network_m(network: FloatWeights, inputs: NDArray[np.float32]) -> NDArray[np.float64]:
     """Return the prediction of a network, shape (n,), m. ONNX Runtime is much faster than NumPy."""
-    import onnxruntime
-
-    session = onnxruntime.InferenceSession(
-        graph.float_model(network), session_options(), providers=["CPUExecutionProvider"]
-    )
-    (source,), (result,) = session.get_inputs(), session.get_outputs()
-    outputs = [
-        session.run([result.name], {source.name: inputs[start : start + _BATCH, None, :]})[0][:, 0]
-        for start in range(0, len(inputs), _BATCH)
-    ]
+    session = Session(graph.float_model(network))
+    starts = range(0, len(inputs), _BATCH)
+    outputs = [session.predict_m(inputs[start : start + _BATCH]) for start in starts]
     return np.concatenate(outputs).astype(np.float64)
 
 

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from uwb_mitigation.mitigation.model.architecture import HEAD, Architecture, Convolution, Mlp, Remnet
-from uwb_mitigation.mitigation.model.weights import FloatWeights
+from uwb_mitigation.mitigation.model.architecture import HEAD, Architecture, Convolution, Dense, Mlp
+from uwb_mitigation.mitigation.model.weights import FloatWeights, evaluate
 
 
 class SameConvolution(nn.Module):
@@ -34,69 +34,59 @@ class SameConvolution(nn.Module):
         return functional.relu(functional.linear(torch.cat(taps, 2), weight, self.bias))
 
 
-class RemnetModule(nn.Module):
-    """The network of `Remnet`: (n, K) to (n,); `dropout`: share of the head's inputs that are dropped."""
+class RectifiedLinear(nn.Linear):
+    """A dense layer with ReLU: (n, inputs) to (n, outputs)."""
 
-    def __init__(self, architecture: Remnet, dropout: float) -> None:
+    def forward(self, values: Tensor) -> Tensor:
+        return functional.relu(super().forward(values))
+
+
+class Network(nn.Module):
+    """A network: (n, K) to (n,); `dropout`: share of the head's inputs that are dropped."""
+
+    def __init__(self, architecture: Architecture, dropout: float) -> None:
         super().__init__()
         self.architecture = architecture
-        # PyTorch does not allow dots in module names.
-        self.layers = nn.ModuleDict(
-            {_key(layer.name): SameConvolution(layer) for layer in architecture.convolutions}
-        )
-        self.dropout = nn.Dropout(dropout)
-        self.head = _head(architecture.features)
+        layers: dict[str, nn.Module] = {
+            # PyTorch does not allow dots in module names.
+            _key(layer.name): RectifiedLinear(layer.inputs, layer.outputs)
+            if isinstance(layer, Dense)
+            else SameConvolution(layer)
+            for layer in architecture.layers
+        }
+        self.layers, self.dropout = nn.ModuleDict(layers), nn.Dropout(dropout)
+        for layer in layers.values():
+            if isinstance(layer, RectifiedLinear):
+                nn.init.xavier_uniform_(layer.weight)
+                nn.init.zeros_(layer.bias)
+        self.head = nn.Linear(architecture.features, 1)
+        # The network refines a linear bias model, so it initially predicts no correction.
+        nn.init.zeros_(self.head.weight)
+        nn.init.zeros_(self.head.bias)
 
     def forward(self, inputs: Tensor) -> Tensor:
-        values = self.layers["first"](inputs[:, :, None])
-        for module in range(1, self.architecture.modules + 1):
-            prefix = f"module{module}"
-            summed = self.layers[_key(f"{prefix}.residual")](values) + values
-            values = self.layers[_key(f"{prefix}.reduce")](summed)
-            values = values + self.layers[_key(f"{prefix}.skip")](summed)
-        output: Tensor = self.head(self.dropout(values.transpose(1, 2).flatten(1)))[:, 0]
+        architecture = self.architecture
+        # Channels last, see `SameConvolution`.
+        first = inputs if isinstance(architecture, Mlp) else inputs[:, :, None]
+        values = evaluate(architecture, first, self._apply_layer, lambda name, one, other: one + other)
+        *_, last = values.values()
+        flat = last if isinstance(architecture, Mlp) else last.transpose(1, 2).flatten(1)
+        output: Tensor = self.head(self.dropout(flat))[:, 0]
+        return output
+
+    def _apply_layer(self, name: str, values: Tensor) -> Tensor:
+        output: Tensor = self.layers[_key(name)](values)
         return output
 
     def by_name(self) -> dict[str, nn.Module]:
         """Return {layer: module with its weights and bias}."""
-        layers = {layer.name: self.layers[_key(layer.name)] for layer in self.architecture.convolutions}
+        layers = {layer.name: self.layers[_key(layer.name)] for layer in self.architecture.layers}
         return {**layers, HEAD: self.head}
-
-
-class MlpModule(nn.Module):
-    """The network of `Mlp`: (n, K) to (n,)."""
-
-    def __init__(self, architecture: Mlp) -> None:
-        super().__init__()
-        self.architecture = architecture
-        self.layers = nn.ModuleDict(
-            {layer.name: nn.Linear(layer.inputs, layer.outputs) for layer in architecture.layers}
-        )
-        for layer in self.layers.values():
-            nn.init.xavier_uniform_(layer.weight)
-            nn.init.zeros_(layer.bias)
-        self.head = _head(architecture.features)
-
-    def forward(self, inputs: Tensor) -> Tensor:
-        values = inputs
-        for layer in self.layers.values():
-            values = functional.relu(layer(values))
-        output: Tensor = self.head(values)[:, 0]
-        return output
-
-    def by_name(self) -> dict[str, nn.Module]:
-        """Return {layer: module with its weights and bias}."""
-        return {**self.layers, HEAD: self.head}
-
-
-Network = RemnetModule | MlpModule
 
 
 def build_network(architecture: Architecture, dropout: float, start: FloatWeights | None = None) -> Network:
     """Return a network with random weights or with those of `start`. Only REMNet has dropout, as in the paper."""
-    network = (
-        MlpModule(architecture) if isinstance(architecture, Mlp) else RemnetModule(architecture, dropout)
-    )
+    network = Network(architecture, 0.0 if isinstance(architecture, Mlp) else dropout)
     if start is not None:
         with torch.no_grad():
             for name, layer in network.by_name().items():
@@ -114,14 +104,6 @@ def weights_of(network: Network) -> FloatWeights:
         weight[name] = (values.T if name == HEAD else values).copy()
         bias[name] = layer.bias.detach().numpy().copy()
     return FloatWeights(network.architecture, weight, bias)
-
-
-def _head(features: int) -> nn.Linear:
-    head = nn.Linear(features, 1)
-    # The network refines a linear bias model, so it initially predicts no correction.
-    nn.init.zeros_(head.weight)
-    nn.init.zeros_(head.bias)
-    return head
 
 
 def _key(layer: str) -> str:

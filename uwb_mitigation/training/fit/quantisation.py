@@ -19,7 +19,7 @@ from uwb_mitigation.mitigation.model.architecture import HEAD
 from uwb_mitigation.mitigation.model.bundle import Bundle, save_bundle
 from uwb_mitigation.mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.mitigation.model.requantisation import nudge
-from uwb_mitigation.mitigation.model.weights import FloatWeights, Int8Weights, layer_inputs, sum_operands
+from uwb_mitigation.mitigation.model.weights import FloatWeights, Int8Weights, inputs_of
 from uwb_mitigation.training.data import splits
 from uwb_mitigation.training.data.dataset import Dataset
 
@@ -63,8 +63,8 @@ def quantise_network(
     if not np.isfinite(calibration).all():
         raise DatasetError("calibration inputs with values that are not finite")
     weight_scale = {name: _weight_scale(name, weight) for name, weight in weights.weight.items()}
-    reads = layer_inputs(architecture)
-    scale = _activation_scales(_peaks(weights, calibration), weight_scale, reads)
+    inputs = inputs_of(architecture)
+    scale = _activation_scales(_peaks(weights, calibration), weight_scale, inputs)
     integers, biases = {}, {}
     limits = np.iinfo(np.int32)
     for name, weight in weights.weight.items():
@@ -74,7 +74,7 @@ def quantise_network(
         )
         rounded = np.clip(np.rint(weight / unit), -WEIGHT_LIMIT, WEIGHT_LIMIT)
         integers[name] = rounded.astype(np.int8)
-        bias = np.rint(weights.bias[name].astype(float) / (scale[reads[name]] * weight_scale[name]))
+        bias = np.rint(weights.bias[name].astype(float) / (scale[inputs[name][0]] * weight_scale[name]))
         biases[name] = np.clip(bias, limits.min, limits.max).astype(np.int32)
     quantised = Int8Weights(architecture, integers, weight_scale, biases, scale)
     return nudge(quantised) if exact else quantised
@@ -128,7 +128,9 @@ def _peaks(weights: FloatWeights, calibration: NDArray[np.float32]) -> dict[str,
 
 
 def _activation_scales(
-    peaks: Mapping[str, float], weight_scale: Mapping[str, NDArray[np.float32]], reads: Mapping[str, str]
+    peaks: Mapping[str, float],
+    weight_scale: Mapping[str, NDArray[np.float32]],
+    inputs: Mapping[str, tuple[str, ...]],
 ) -> dict[str, np.float32]:
     """Return scales at which 255 represents the peaks, or more where integer arithmetic requires it.
 
@@ -139,10 +141,10 @@ def _activation_scales(
     scale: dict[str, np.float32] = {}
     for tensor, peak in peaks.items():
         target = max(peak, 1e-6) / 255
-        if tensor in reads and tensor != HEAD:
-            target = max(target, 17 * float(scale[reads[tensor]]) * float(weight_scale[tensor].max()))
+        if tensor in weight_scale:
+            target = max(target, 17 * float(scale[inputs[tensor][0]]) * float(weight_scale[tensor].max()))
         elif tensor != "input":
-            first, second = sum_operands(tensor)
+            first, second = inputs[tensor]
             least = MIN_SCALE_RATIO * float(max(scale[first], scale[second]))
             scale |= {name: np.float32(max(float(scale[name]), least)) for name in (first, second)}
             target = max(target, 0.501 * (float(scale[first]) + float(scale[second])))
