@@ -102,14 +102,14 @@ class OdometryFilter:
         distance = max(point.distance_m - before.distance_m, 0.0)
         drift, turn = point.drift - before.drift, point.turn - before.turn
         scale += 1.0
-        x[0], x[1] = east + scale * dx, north + scale * dy
-        x[YAW] = yaw + point.yaw - before.yaw + drift * yaw_drift + turn * yaw_turn
         if distance or drift or turn:
             F = _IDENTITY.copy()
             F[0, YAW], F[0, SCALE], F[1, YAW], F[1, SCALE] = -scale * dy, dx, scale * dx, dy
             F[YAW, DRIFT], F[YAW, TURN] = drift, turn
             P[:SCALE] = F.dot(P[:MOTION])
             P[:, :SCALE] = P[:, :MOTION].dot(F.T)
+        x[0], x[1] = east + scale * dx, north + scale * dy
+        x[YAW] = yaw + point.yaw - before.yaw + drift * yaw_drift + turn * yaw_turn
         q = max(point.position_variance - before.position_variance, 0.0)
         P[0, 0] += q
         P[1, 1] += q
