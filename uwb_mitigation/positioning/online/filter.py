@@ -144,8 +144,7 @@ class RangeFilter:
     def estimate(self, stamp_ns: int) -> Estimate:
         """Return position and velocity, at the stamp that the state is for."""
         state = self.state
-        x, covariance = state.x, state.P[:6, :6].copy()
-        covariance *= state.covariance_scale()
+        x, covariance = state.x, state.P[:6, :6] * state.covariance_scale()
         covariance[:3, :3] += self.unseen
         return Estimate(stamp_ns, x[:3].copy(), x[3:6].copy(), covariance)
 

@@ -134,11 +134,9 @@ class RobustUpdate:
             return rows[anchor]
         if not rows:
             size = min(MAX_CONSTANT, len(self._error_variance))
-            n, motion = len(self.x), self.H[: self._offset].copy()
-            padded = np.zeros((n + size + 1, n + size))
-            padded[:n, :n], padded[-1, :n] = self.P, self.x
-            self._set_moments(padded)
-            self.H[: self._offset] = motion
+            H, columns = self.H, np.pad(self.moments, ((0, 0), (0, size)))
+            self._set_moments(np.insert(columns, [len(H)] * size, 0.0, axis=0))
+            self.H[: len(H)] = H
         x, P = self.x, self.P
         free = self._offset + 1 + len(self._error_variance) + len(rows)
         row = free if free < len(x) else rows.pop(next(iter(rows)))
