@@ -225,9 +225,8 @@ class RobustUpdate:
         S = float(H.dot(PH)) + max(R, MIN_VARIANCE_M2)
         sd = math.sqrt(S)
         z, product[-1] = innovation / sd, -innovation
-        gain = PH
+        gain = PH.copy()
         if not self.estimates_errors:
-            gain = PH.copy()
             gain[self._offset :] = 0.0
         # This is Joseph's form for these gains: moments -= product gain.T / S, in place.
         factor = -1.0 / (S * self._model.inflation(z) if robust else S)
