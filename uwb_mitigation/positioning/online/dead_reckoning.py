@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
+from itertools import repeat
+from operator import add, mul
 from typing import NamedTuple
 
 from uwb_mitigation.types.stamps import NS_PER_S
@@ -246,17 +248,5 @@ def _twist_of_poses(
 
 def _moved(point: PathPoint, rates: tuple[float, ...], dt: float, source: int) -> PathPoint:
     """Return the point after a time with constant rates of its values."""
-    segment, x, y, yaw, distance_m, drift, turn, position_variance, yaw_variance, _ = point
-    east, north, yaw_rate, speed, of_drift, of_turn, of_position, of_yaw = rates
-    return PathPoint(
-        segment,
-        x + east * dt,
-        y + north * dt,
-        yaw + yaw_rate * dt,
-        distance_m + speed * dt,
-        drift + of_drift * dt,
-        turn + of_turn * dt,
-        position_variance + of_position * dt,
-        yaw_variance + of_yaw * dt,
-        source,
-    )
+    changes = map(mul, rates, repeat(dt))
+    return PathPoint._make((point.segment, *map(add, point[1:9], changes), source))

@@ -86,16 +86,17 @@ class RangeFilter:
         if dt <= 0.0:
             return
         self.time_s = time_s
-        x, P, F = self.state.x, self.state.P, _IDENTITY.copy()
+        moments, F = self.state.moments, _IDENTITY.copy()
         F[0, 3] = F[1, 4] = F[2, 5] = dt
-        x[:3] = F.dot(x[:6])
-        P[:3] = F.dot(P[:6])
-        P[:, :3] = P[:, :6].dot(F.T)
-        n, axes, q = len(x), 2 if self.is_level else 3, self._model.acceleration**2 * dt
-        cross, variances = q * dt / 2.0, P.reshape(-1)
-        for first, noise in ((0, q * dt * dt / 3.0), (3, cross), (3 * n, cross), (3 * n + 3, q)):
-            diagonal = variances[first : first + axes * (n + 1) : n + 1]
-            diagonal += noise
+        moments[:3] = F.dot(moments[:6])
+        moments[:, :3] = moments[:, :6].dot(F.T)
+        q = self._model.acceleration**2 * dt
+        cross, of_position = q * dt / 2.0, q * dt * dt / 3.0
+        for axis in range(2 if self.is_level else 3):
+            moments[axis, axis] += of_position
+            moments[axis, axis + 3] += cross
+            moments[axis + 3, axis] += cross
+            moments[axis + 3, axis + 3] += q
         self.state.predict_errors(dt / self._model.persistence_s)
 
     def update(
@@ -143,8 +144,7 @@ class RangeFilter:
     def estimate(self, stamp_ns: int) -> Estimate:
         """Return position and velocity, at the stamp that the state is for."""
         state = self.state
-        x, covariance = state.x, state.P[:6, :6].copy()
-        covariance *= state.covariance_scale()
+        x, covariance = state.x, state.P[:6, :6] * state.covariance_scale()
         covariance[:3, :3] += self.unseen
         return Estimate(stamp_ns, x[:3].copy(), x[3:6].copy(), covariance)
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import copy
 import math
+from operator import sub
 
 import numpy as np
 
@@ -89,32 +90,31 @@ class OdometryFilter:
             return
         self.time_s, self.point = time_s, point
         x, P = self.state.x, self.state.P
-        if point.source != before.source:
+        _, dx, dy, turned, distance, drift, turn, of_position, of_yaw, source = map(sub, point, before)
+        if source:
             # The errors of wheels say nothing about those of an IMU.
             for index in (DRIFT, TURN):
                 x[index] = P[index] = P[:, index] = 0.0
                 P[index, index] = 1.0
         east, north, _, yaw, scale, yaw_drift, yaw_turn = x[:MOTION].tolist()
-        relative = yaw - before.yaw
-        cosine, sine = math.cos(relative), math.sin(relative)
-        dx, dy = point.x - before.x, point.y - before.y
+        cosine, sine = math.cos(yaw - before.yaw), math.sin(yaw - before.yaw)
         dx, dy = cosine * dx - sine * dy, sine * dx + cosine * dy
-        distance = max(point.distance_m - before.distance_m, 0.0)
-        drift, turn = point.drift - before.drift, point.turn - before.turn
         scale += 1.0
-        x[0], x[1] = east + scale * dx, north + scale * dy
-        x[YAW] = yaw + point.yaw - before.yaw + drift * yaw_drift + turn * yaw_turn
         if distance or drift or turn:
             F = _IDENTITY.copy()
             F[0, YAW], F[0, SCALE], F[1, YAW], F[1, SCALE] = -scale * dy, dx, scale * dx, dy
             F[YAW, DRIFT], F[YAW, TURN] = drift, turn
             P[:SCALE] = F.dot(P[:MOTION])
             P[:, :SCALE] = P[:, :MOTION].dot(F.T)
-        q = max(point.position_variance - before.position_variance, 0.0)
+        x[0], x[1] = east + scale * dx, north + scale * dy
+        x[YAW] = yaw + turned + drift * yaw_drift + turn * yaw_turn
+        # Sums are smaller than before if they were extrapolated.
+        q = max(of_position, 0.0)
         P[0, 0] += q
         P[1, 1] += q
-        P[YAW, YAW] += max(point.yaw_variance - before.yaw_variance, 0.0)
-        self.state.predict_errors(distance / (self._model.persistence_s * WALKING_SPEED) + dt / STATIONARY_S)
+        P[YAW, YAW] += max(of_yaw, 0.0)
+        driven = max(distance, 0.0) / (self._model.persistence_s * WALKING_SPEED)
+        self.state.predict_errors(driven + dt / STATIONARY_S)
 
     def update(
         self, anchor: int, range_m: float, variance_m2: float, is_corrected: bool

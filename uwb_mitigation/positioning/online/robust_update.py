@@ -16,6 +16,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.blas import dger
 
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.types.anchors import AnchorMap
@@ -72,6 +73,7 @@ class RobustUpdate:
         x, P: state float64 (n,) and its covariance (n, n). Persisting errors are in units of `error_unit`, and their variances lack the
             noise since the anchor's latest range: so a prediction does not change their rows and columns. See `normalise`.
         error_unit: decays with the persisting errors, m.
+        moments: float64 (n + 1, n), P and below it x, which are views of it: many operations are the same for both.
         H: float64 (n,), derivatives of the next range with respect to the motion states, which the owner sets.
         estimates_errors: whether measurements change offset and errors, which are only considered otherwise.
         consistency: running mean of the second moments of the persisting errors, relative to the model; 1: they are as modelled.
@@ -90,17 +92,24 @@ class RobustUpdate:
         self._constant_rows: dict[int, int] = {}
         # Whether the latest range of an anchor was raw.
         self._is_raw: dict[int, bool] = {}
-        self.H, self.x, self.P = np.zeros(n), np.zeros(n), np.zeros((n, n))
+        self._set_moments(np.zeros((n + 1, n)))
         self.x[: len(motion)] = motion
         self.P[self._offset, self._offset] = model.offset_sd**2
         errors = np.arange(self._offset + 1, n)
         self.P[errors, errors] = self._error_variance
 
+    def _set_moments(self, moments: NDArray[np.float64]) -> None:
+        self.moments = moments
+        self.P: NDArray[np.float64] = moments[:-1]
+        self.x: NDArray[np.float64] = moments[-1]
+        self.H = np.zeros(len(self.x))
+        self.H[self._offset] = 1.0
+
     def copy(self) -> RobustUpdate:
         """Return an independent copy."""
         twin = copy.copy(self)
-        lists = "_error_variance", "_last_residual", "_noise_until"
-        for name in ("H", "P", "x", "_constant_rows", "_is_raw", *lists):
+        twin._set_moments(self.moments.copy())
+        for name in ("_constant_rows", "_is_raw", "_error_variance", "_last_residual", "_noise_until"):
             setattr(twin, name, getattr(self, name).copy())
         return twin
 
@@ -109,12 +118,12 @@ class RobustUpdate:
         self.normalise()
         twin, k, old = self.copy(), len(motion), self._offset
         twin._offset = k
-        twin.x = np.concatenate([motion, self.x[old:]])
-        n = len(twin.x)
-        twin.H, twin.P = np.zeros(n), np.zeros((n, n))
-        retained = np.r_[0:3, k:n]
         before = np.r_[0:3, old : len(self.x)]
+        n = k + len(self.x) - old
+        twin._set_moments(np.zeros((n + 1, n)))
+        retained = np.r_[0:3, k:n]
         twin.P[np.ix_(retained, retained)] = self.P[np.ix_(before, before)]
+        twin.x[:k], twin.x[k:] = motion, self.x[old:]
         twin._constant_rows = {anchor: row + k - old for anchor, row in self._constant_rows.items()}
         return twin
 
@@ -125,8 +134,9 @@ class RobustUpdate:
             return rows[anchor]
         if not rows:
             size = min(MAX_CONSTANT, len(self._error_variance))
-            self.x, self.H = np.pad(self.x, (0, size)), np.pad(self.H, (0, size))
-            self.P = np.pad(self.P, (0, size))
+            H, columns = self.H, np.pad(self.moments, ((0, 0), (0, size)))
+            self._set_moments(np.insert(columns, [len(H)] * size, 0.0, axis=0))
+            self.H[: len(H)] = H
         x, P = self.x, self.P
         free = self._offset + 1 + len(self._error_variance) + len(rows)
         row = free if free < len(x) else rows.pop(next(iter(rows)))
@@ -184,8 +194,8 @@ class RobustUpdate:
         self._error_variance[anchor] = error_variance + 0.1 * (
             (1.0 - white_share) * variance - error_variance
         )
-        H[k:] = 0.0
-        H[k], H[row] = 1.0, unit
+        H[k + 1 :] = 0.0
+        H[row] = unit
         residual = range_m - distance_m - x.item(k)
         innovation = residual - unit * x.item(row)
         if is_corrected:
@@ -209,20 +219,21 @@ class RobustUpdate:
         self, H: NDArray[np.float64], innovation: float, R: float, *, robust: bool = True
     ) -> tuple[float, float]:
         """Update with a measurement with Jacobian H (n,) and noise variance R; return as `update_range`."""
-        # The method `dot` is faster here than the operator.
-        P = self.P
-        PH = P.dot(H)
+        # The method `dot` and BLAS are faster here than operators.
+        product = self.moments.dot(H)
+        PH = product[:-1]
         S = float(H.dot(PH)) + max(R, MIN_VARIANCE_M2)
         sd = math.sqrt(S)
-        z = innovation / sd
-        K = PH / (S * self._model.inflation(z) if robust else S)
+        z, product[-1] = innovation / sd, -innovation
+        gain = PH.copy()
         if not self.estimates_errors:
-            K[self._offset :] = 0.0
-        self.x += K * innovation
-        # This is Joseph's form for these gains. The covariance of errors that are only considered stays.
-        P -= K[:, None].dot(PH[None])
+            gain[self._offset :] = 0.0
+        # This is Joseph's form for these gains: moments -= product gain.T / S, in place.
+        factor = -1.0 / (S * self._model.inflation(z) if robust else S)
+        dger(factor, gain, product, 1, 1, self.moments.T, 1, 1, 1)
         if not self.estimates_errors:
-            P[self._offset :] = P[:, self._offset :].T
+            # The covariance of errors that are only considered stays.
+            self.P[:, self._offset :] = self.P[self._offset :].T
         return z, sd
 
     def project(self, axis: int, value: float) -> None:
