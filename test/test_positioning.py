@@ -30,7 +30,7 @@ from uwb_mitigation.positioning.multi_tag import MultiTagEstimator
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.ambiguity import Ambiguity, AmbiguityCheck
 from uwb_mitigation.positioning.online.filter import FIRST_ERROR, OFFSET, RangeFilter
-from uwb_mitigation.positioning.online.initialization import candidate_positions
+from uwb_mitigation.positioning.online.initialization import candidate_positions, snapshot
 from uwb_mitigation.positioning.online.measurements import TagRange
 from uwb_mitigation.positioning.online.robust_update import (
     CONSTANT_SD,
@@ -113,6 +113,17 @@ def test_constant_errors_of_corrected_ranges_are_estimated():
     last = slice(len(ranges) // 2, None)
     corrected_rmse = track_errors(with_variance.run(ranges).take(last), truth).rmse
     assert corrected_rmse < 0.8 * track_errors(without.run(raw).take(last), truth).rmse
+
+
+def test_large_constant_errors_of_raw_ranges_do_not_make_the_filter_follow_a_few_anchors():
+    corners = anchors_at([(x, y, z) for x in (0.0, 12.0) for y in (0.0, 9.0) for z in (0.3, 2.5)])
+    ranges, truth = drive(corners, rate_hz=80.0, seed=3)
+    ranges.range_m[:] += np.array([0.6, -0.8, 0.1, -0.2, -0.1, -0.1, -0.6, -0.1])[ranges.anchor]
+    raw, height = replace(ranges, is_corrected=False), Height(1.0)
+    live = TagEstimator(EstimatorConfig(corners, height=height)).run(raw)
+    late = truth.take(truth.stamp_ns > 20 * NANOSECONDS)
+    simple = track_errors(snapshot(corners, raw, height), late)
+    assert track_errors(live, late).rmse < 1.1 * simple.rmse
 
 
 def test_number_of_constant_errors_is_bounded():
