@@ -70,5 +70,3 @@ def test_files_that_belong_together_are_written_atomically(
     assert set(tmp_path.iterdir()) == {path, link}
     write_all_atomically({path: "new", tmp_path / "other": b"new"})
     assert [one.read_text() for one in (path, tmp_path / "other")] == ["new", "new"]
-
-

@@ -180,7 +180,9 @@ def test_flags_and_log_level_have_choices_which_launch_checks(generate, file: st
     arguments, _ = described(generate, file)
     choices = {name: getattr(argument, "choices", None) for name, argument in arguments.items()}
     flags = {"one_process", "locate", "viewer", "rviz", "foxglove", "use_sim_time", "respawn"}
-    assert {name for name, values in choices.items() if values == launching.BOOLEANS} == flags & set(arguments)
+    assert {name for name, values in choices.items() if values == launching.BOOLEANS} == flags & set(
+        arguments
+    )
     assert choices["log_level"] == launching.LOG_LEVELS
 
 
