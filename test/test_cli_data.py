@@ -13,7 +13,7 @@ from command_line import run, start, succeed
 
 from uwb_mitigation.recordings.bag.reader import BagReader
 from uwb_mitigation.recordings.bag.writer import BagWriter
-from uwb_mitigation.recordings.mcap import McapRecording
+from uwb_mitigation.recordings.formats import open_recording
 from uwb_mitigation.recordings.summary import PauseShortener
 from uwb_mitigation.types.measurement import Cir, RangeMeasurement, Record
 from uwb_mitigation.types.ros import codec
@@ -84,7 +84,9 @@ def messages(record: Record) -> tuple[bytes, bytes]:
     return codec.encode_range(measurement), codec.encode_truth(measurement, record.truth)
 
 
-def test_all_apartment_logs_become_one_bag(apartment_imported: Path, apartment_reading: list[Record]) -> None:
+def test_all_apartment_logs_become_one_bag(
+    apartment: Path, apartment_imported: Path, apartment_reading: list[Record]
+) -> None:
     result = json.loads((apartment_imported / "import.json").read_text())
     assert (result["pairs"], result["ranges"], result["with_truth"]) == (28, 4151, 4151)
     # A parser that reads the logs line by line counts the same.
@@ -96,9 +98,9 @@ def test_all_apartment_logs_become_one_bag(apartment_imported: Path, apartment_r
     }
     printed = (apartment_imported / "printed.txt").read_text()
     assert all(kind in printed for kind in result["skipped"])
-    imported = McapRecording(apartment_imported / "apartment.mcap")
-    for item, expected in zip(imported, apartment_reading, strict=True):
-        assert messages(item) == messages(expected)
+    with open_recording(apartment) as logs:
+        for item, expected in zip(apartment_reading, logs, strict=True):
+            assert messages(item) == messages(expected)
 
 
 def test_import_shortens_pauses_by_default_and_reports_it(tmp_path: Path) -> None:
