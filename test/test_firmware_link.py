@@ -22,6 +22,7 @@ from uwb_mitigation.radios.wire import messages
 from uwb_mitigation.radios.wire.framing import FrameDecoder, FrameEncoder, WireFrame, encode_frame
 from uwb_mitigation.radios.wire.layout import HEADER, MAX_OFFSETS, MAX_PAYLOAD_BYTES, Flag, MessageType, Mode
 from uwb_mitigation.radios.wire.messages import SetMode, SetOffsets
+from uwb_mitigation.types.measurement import RangeMeasurement
 from uwb_mitigation.types.offsets import Offsets
 
 pytestmark = NEEDS_CC
@@ -34,9 +35,9 @@ KINDS = ("frames", "bad_cobs", "bad_length", "bad_crc", "oversize", "foreign_ver
 class BoardInC:
     """`firmware/test/native_board.c`; each method returns the bytes that the board sends."""
 
-    def __init__(self, library: ctypes.CDLL, mode: Mode, with_model: bool = True) -> None:
+    def __init__(self, library: ctypes.CDLL, mode: Mode, with_model: bool = True, queue: int = 16384) -> None:
         self._library = library
-        self._board = library.native_board_new(int(mode), int(with_model), 16384)
+        self._board = library.native_board_new(int(mode), int(with_model), queue)
         self.sent = self._output()
 
     def receive(self, data: bytes, now_us: int, *, read: bool = True) -> bytes:
@@ -225,6 +226,21 @@ def test_board_without_a_model_stays_in_host_mode(library: ctypes.CDLL):
     (frame,) = FrameDecoder().feed(c.receive(request, 1))
     hello = messages.decode(frame.type, frame.payload)
     assert (hello.mode, hello.model_id, hello.window, frame.flags) == (Mode.HOST, 0, 0, Flag.ANSWER)
+
+
+def test_slow_host_loses_complete_measurements_but_no_status(library: ctypes.CDLL):
+    c = BoardInC(library, Mode.HOST, queue=9000)
+    measured = firmware_models.random_measurement(np.random.default_rng(3))
+    wire = FrameEncoder().encode(*messages.encode(measured))
+    for _ in range(200):
+        c.measure(wire, 5, read=False)
+    frames = FrameDecoder().feed(c.tick(2_000_000))
+    *ranges, status = [messages.decode(frame.type, frame.payload) for frame in frames]
+    assert all(isinstance(message, RangeMeasurement) for message in ranges)
+    assert isinstance(status, messages.BoardStatus)
+    assert status.measurements == 200
+    assert status.measurements_lost == 200 - len(ranges) > 0
+    assert [frame.sequence for frame in frames] == list(range(1, len(frames) + 1))
 
 
 def test_clock_request_is_answered_before_queued_messages(library: ctypes.CDLL):

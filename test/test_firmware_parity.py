@@ -37,10 +37,9 @@ SANITIZED = ("-O1", "-fsanitize=undefined", "-fno-sanitize-recover=all")
 
 @pytest.mark.parametrize("shape", firmware_models.SHAPES, ids=str)
 def test_c_and_reference_equal_onnx_runtime(shape: tuple[int, int, int], tmp_path: Path):
-    exported = firmware_models.exported(shape, tmp_path)
-    windows = exported.windows()
-    expected = bits(exported.subject.expect(windows))
-    assert np.array_equal(bits(IntegerNetwork(exported.weights).predict_m(windows)), expected)
+    weights, subject, windows = firmware_models.exported(shape, tmp_path)
+    expected = bits(subject.expect(windows))
+    assert np.array_equal(bits(IntegerNetwork(weights).predict_m(windows)), expected)
     flags = () if shape in firmware_models.PUBLISHED else SANITIZED
     assert np.array_equal(bits(CompiledFirmware(tmp_path, tmp_path, flags).predict_m(windows)), expected)
 

@@ -105,6 +105,7 @@ def test_layer_with_tiny_weights_can_be_quantised_for_all_processors(layer):
     weights.bias[layer][:] *= np.float32(1e-7)
     inputs = windows(50, 8)
     integers = quantise_network(weights, inputs)
+    assert integers.activation_scale[layer] < 1e-4, "its integers use their range"
     expected = floating.predict_m(weights, inputs)
     assert np.abs(IntegerNetwork(integers).predict_m(inputs) - expected).mean() < 0.25 * expected.std()
     again = requantisation.nudge(integers)
