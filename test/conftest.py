@@ -20,8 +20,9 @@ from browser import Browser, chromium
 from drives import HALL
 from fast import SLOW_FIXTURES, is_fast
 from hypothesis import HealthCheck, settings
-from real_logs import import_once, read_once
+from real_logs import import_once
 
+from uwb_mitigation.recordings.mcap import McapRecording
 from uwb_mitigation.types.anchors import dump_anchors
 
 if TYPE_CHECKING:
@@ -105,15 +106,15 @@ def apartment(data: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def apartment_reading(apartment: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Record]:
-    """Return all exchanges of the real logs."""
-    return read_once(apartment, tmp_path_factory)
-
-
-@pytest.fixture(scope="session")
 def apartment_imported(apartment: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with the real logs in `apartment.mcap`, which is read faster; see `import_once`."""
     return import_once(apartment, tmp_path_factory)
+
+
+@pytest.fixture(scope="session")
+def apartment_reading(apartment_imported: Path) -> list[Record]:
+    """Return all exchanges of the real logs."""
+    return list(McapRecording(apartment_imported / "apartment.mcap"))
 
 
 @pytest.fixture

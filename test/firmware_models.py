@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import model_material
@@ -111,34 +111,20 @@ def real_measurements(apartment: Path) -> tuple[RangeMeasurement, ...]:
     return tuple(measured)
 
 
-@dataclass(frozen=True)
-class Exported:
-    """An exported network of one shape."""
-
-    weights: Int8Weights
-    subject: Network
-
-    def windows(self, count: int = 500) -> NDArray[np.float32]:
-        """Return windows that test every rounding: zero, saturating and random ones."""
-        samples = self.weights.architecture.samples
-        return random_networks.rounding_windows(samples, self.weights.activation_scale["input"], count)
+PUBLISHED = [*itertools.product((3, 5), published.WINDOWS, (3,)), (0, 157, 0)]
+SHAPES = [*PUBLISHED, (3, 9, 1), (3, 12, 2), (3, 23, 3), (3, 40, 2), (3, 81, 3), (3, 156, 1)]
+"""First kernel (0: MLP), length and number of modules of each tested network."""
 
 
-SHAPES = [*itertools.product((3, 5), published.WINDOWS), (0, 157)]
-"""First kernel and length of each tested network; 0: MLP."""
-
-
-SIZES = [(9, 1), (12, 2), (23, 3), (40, 2), (81, 3), (156, 1)]
-"""Lengths and numbers of modules that are not published."""
-
-
-def shape_name(shape: tuple[int, int]) -> str:
-    return f"k0={shape[0]}, K={shape[1]}" if shape[0] else "MLP"
-
-
-def exported(shape: tuple[int, int], folder: Path) -> Exported:
-    first_kernel, samples = shape
-    weights = random_networks.remnet(samples, first_kernel) if first_kernel else random_networks.mlp(samples)
+def exported(shape: tuple[int, int, int], folder: Path) -> tuple[Int8Weights, Network, NDArray[np.float32]]:
+    """Export a random network of a shape; also return windows that test every rounding."""
+    first_kernel, samples, modules = shape
+    if first_kernel:
+        weights = random_networks.remnet(samples, first_kernel, modules)
+    else:
+        weights = random_networks.mlp(samples)
     write_model(folder, weights)
     subject = network_of(weights, None, MODEL_ID, graph.int8_model(weights))
-    return Exported(weights, subject)
+    count = 500 if shape in PUBLISHED else 200
+    windows = random_networks.rounding_windows(samples, weights.activation_scale["input"], count)
+    return weights, subject, windows

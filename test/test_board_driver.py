@@ -49,28 +49,19 @@ def test_port_in_use_is_reported_with_the_program(exclusive: bool):
 
 
 @pytest.mark.parametrize(
-    ("text", "address"),
-    [
-        ("/dev/ttyACM0", PortAddress("/dev/ttyACM0")),
-        ("usb:2341:805a", PortAddress("", 0x2341, 0x805A)),
-        ("usb:2341:805A:AB:12", PortAddress("", 0x2341, 0x805A, "AB:12")),
-    ],
+    ("text", "device"),
+    [("usb:2341:805a", "ttyACM0"), ("usb:2341:805A:B:1", "ttyACM1"), ("usb:2341:805a:C", None)],
 )
-def test_address_names_a_file_or_a_usb_device(text, address):
-    assert PortAddress.parse(text) == address
-    assert PortAddress.parse(str(address)) == address
-
-
-def test_usb_device_is_found_by_its_ids_and_serial_number(monkeypatch):
+def test_usb_device_is_found_by_its_ids_and_serial_number(monkeypatch, text: str, device: str | None):
     devices = (("ttyS0", None, 1, None), ("ttyS1", 0x2341, 1, "A"), ("ttyACM0", 0x2341, 0x805A, "A"))
-    devices += (("ttyACM1", 0x2341, 0x805A, "B"),)
+    devices += (("ttyACM1", 0x2341, 0x805A, "B:1"),)
     names = ("device", "vid", "pid", "serial_number")
-    ports = [SimpleNamespace(**dict(zip(names, device, strict=True))) for device in devices]
+    ports = [SimpleNamespace(**dict(zip(names, values, strict=True))) for values in devices]
     monkeypatch.setattr("serial.tools.list_ports.comports", lambda: ports)
 
-    assert PortAddress.parse("usb:2341:805a").find() == "ttyACM0"
-    assert PortAddress.parse("usb:2341:805a:B").find() == "ttyACM1"
-    assert PortAddress.parse("usb:2341:805a:C").find() is None
+    address = PortAddress.parse(text)
+    assert address.find() == device
+    assert PortAddress.parse(str(address)) == address
 
 
 @pytest.mark.parametrize(

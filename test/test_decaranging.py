@@ -109,16 +109,6 @@ def read(path: Path, cir: CirFrame = CirFrame.FINAL) -> tuple[list[Record], Coun
     return records, log.skipped - Counter({Anomaly.NO_TRUTH.value: 1})
 
 
-def read_until_damage(path: Path) -> tuple[list[Record], RecordingError | None]:
-    records: list[Record] = []
-    try:
-        for record in DecaRangingLog(path):
-            records.append(record)  # noqa: PERF402 - records before the error are needed
-    except RecordingError as error:
-        return records, error
-    return records, None
-
-
 def counts(*anomalies: Anomaly) -> dict[str, int]:
     return dict(Counter(anomaly.value for anomaly in anomalies))
 
@@ -182,10 +172,10 @@ def test_invalid_start_time_becomes_the_epoch(write, file):
         (poll(0) + received(0x2A, 1, dump(ramp(5))) + final(2) + ranged(5.0), 6, []),
         (poll(0) + final(1, rsl="-001.#INF") + ranged(5.0), 6, [Anomaly.NOT_A_NUMBER]),
         (poll(0) + final(1, hlp="") + ranged(5.0), 6, [Anomaly.NOT_A_NUMBER]),
-        (poll(0) + final(1).replace("NTH(03CB)", "NTH(zz)") + ranged(5.0), 0, None),
-        (poll(0) + final(1).replace("PSC(0998)", "PSC(99999)") + ranged(5.0), 0, None),
-        (poll(0) + final(1).replace("RX DATA: 41cc", "RX DATA: zz") + ranged(5.0), 0, None),
-        (poll(0) + final(1).replace("RX DATA: 41cc", "RX DATA: " + "4" * 300_000) + ranged(5.0), 0, None),
+        *(
+            (poll(0) + final(1).replace(good, bad) + ranged(5.0), 0, None)
+            for good, bad in (("03CB", "zz"), ("0998", "99999"), ("41cc", "zz"), ("41cc", "4" * 300_000))
+        ),
         ("\x00\x01\xff garbage\n" + exchange(5.0), 6, []),
     ],
 )
@@ -211,15 +201,11 @@ def test_range_that_is_not_a_number_is_nan(write, text):
 @pytest.mark.parametrize(
     "bad",
     [
-        dump([(1, 2), (3.5, 4), (5, 6)]),
-        dump([(1, 2), (32768, 4), (5, 6)]),
+        *(dump([(1, 2), (sample, 4), (5, 6)]) for sample in (3.5, 32768, "9" * 400)),
         dump([(1, 2), ("3", ""), (5, 6)]),
-        dump([(1, 2), ("9" * 400, 4), (5, 6)]),
         dump([(1, 2), (3, 4)], length=3),
-        dump(ramp(0), length=4),
+        *(dump(ramp(0), length) for length in (4, 999_999_999, -1)),
         dump(ramp(0, 1017)),
-        dump(ramp(0), length=999_999_999),
-        dump(ramp(0), length=-1),
     ],
 )
 def test_malformed_accumulator_loses_only_the_cir(write, bad):
@@ -241,7 +227,11 @@ def test_log_cut_at_any_byte_yields_the_exchanges_before_the_cut(write):
     complete = contents(read(path)[0])
     for size in range(0, len(data), 7):
         path.write_bytes(data[:size])
-        records, error = read_until_damage(path)
+        records, error = [], None
+        try:
+            records.extend(DecaRangingLog(path))
+        except RecordingError as caught:
+            error = caught
         assert contents(records) == complete[: sum(end <= size for end in line_ends)]
         if size > 200 and data[size - 1 : size] != b"\n":
             assert isinstance(error, DamagedRecordingError)

@@ -148,8 +148,8 @@ def check_parameters(node: str, values: dict[str, object]) -> None:
             rows[name].check(value)
 
 
-def check_node(words: list[str]) -> None:
-    """Check the words after `ros2 run uwb_mitigation`."""
+@pytest.mark.parametrize("words", lines_of("ros2", "run", "uwb_mitigation"))
+def test_nodes_on_pages_have_the_given_parameters(words: list[str]):
     node, *options = words
     assert node in NODES
     pairs = [option for flag, option in pairwise(options) if flag == "-p"]
@@ -160,11 +160,6 @@ def check_node(words: list[str]) -> None:
     assert set(remapped) <= {"__node", "uwb/range_raw", "uwb/range_corrected", "uwb/pose"}
     values = [*pairs, *(option for flag, option in pairwise(options) if flag in ("-r", "--params-file"))]
     assert set(options) <= {"--ros-args", "-p", "-r", "--params-file", *values}
-
-
-@pytest.mark.parametrize("words", lines_of("ros2", "run", "uwb_mitigation"))
-def test_nodes_on_pages_have_the_given_parameters(words: list[str]):
-    check_node(words)
 
 
 @pytest.mark.parametrize("words", lines_of("ros2", "param", "set"))

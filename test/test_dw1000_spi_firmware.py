@@ -5,6 +5,7 @@ The exchange of the anchor is written here from the layout of the frames.
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator
 from types import SimpleNamespace
 
@@ -54,26 +55,23 @@ def air(monkeypatch: pytest.MonkeyPatch) -> Iterator[Air]:
         yield air
 
 
-def frame(
-    kind: int, pan: int, to: int, numbers: tuple[int, int], stamps: tuple[int, ...] = (0, 0, 0)
-) -> list[int]:
-    """Return a frame with the layout of `firmware/src/uwb_twr_frame.c`."""
-    head = b"\x41\xcc" + bytes((numbers[0] & 0xFF,)) + pan.to_bytes(2, "little")
-    body = to.to_bytes(8, "little") + OTHERS.to_bytes(8, "little") + bytes((0x75, kind))
-    body += b"".join(number.to_bytes(4, "little") for number in numbers)
-    return list(head + body + b"".join(stamp.to_bytes(5, "little") for stamp in stamps))
+FRAME = struct.Struct("<2s B H Q Q 2B 2I 15s")
+"""Layout of `firmware/src/uwb_twr_frame.c`."""
+
+
+def frame(kind: int, poll: SimpleNamespace, anchor: int, stamps: tuple[int, ...] = (0, 0, 0)) -> list[int]:
+    """Return a frame that answers a poll."""
+    ids = poll.tag & 0xFF, poll.pan, poll.source, OTHERS
+    ticks = b"".join(stamp.to_bytes(5, "little") for stamp in stamps)
+    return list(FRAME.pack(b"\x41\xcc", *ids, 0x75, kind, poll.tag, anchor, ticks))
 
 
 def parsed(octets: list[int] | None) -> SimpleNamespace | None:
     data = bytes(octets or b"")
-    if len(data) != 46 or data[:2] != b"\x41\xcc":
+    if len(data) != FRAME.size or data[:2] != b"\x41\xcc":
         return None
-
-    def number(at: int, size: int) -> int:
-        return int.from_bytes(data[at : at + size], "little")
-
-    ids = {"pan": number(3, 2), "source": number(13, 8), "tag": number(23, 4), "anchor": number(27, 4)}
-    return SimpleNamespace(**ids, kind=data[22], stamps=tuple(number(31 + 5 * k, 5) for k in range(3)))
+    _, _, pan, _, source, _, kind, tag, anchor, _ = FRAME.unpack(data)
+    return SimpleNamespace(pan=pan, source=source, kind=kind, tag=tag, anchor=anchor)
 
 
 @pytest.mark.parametrize("distance_m", [2.0, 40.0])
@@ -92,13 +90,12 @@ def test_tag_ranges_with_an_independent_anchor(air: Air, distance_m: float):
                 poll = parsed(octets)
                 if poll is None or poll.kind != POLL:
                     continue
-                numbers = (poll.tag, 0x5EED)
-                _, answered = driver.transmit(frame(ANSWER, poll.pan, poll.source, numbers), ranging=True)
+                _, answered = driver.transmit(frame(ANSWER, poll, 0x5EED), ranging=True)
                 octets, finished = driver.listen(True, 0.02)
                 final = parsed(octets)
-                if final is not None and (final.kind, final.tag, final.anchor) == (FINAL, *numbers):
+                if final is not None and (final.kind, final.tag, final.anchor) == (FINAL, poll.tag, 0x5EED):
                     stamps = (polled, answered, finished)
-                    driver.transmit(frame(REPORT, poll.pan, poll.source, numbers, stamps), ranging=False)
+                    driver.transmit(frame(REPORT, poll, 0x5EED, stamps), ranging=False)
 
     air.program(tag, ranging(RadioSettings(anchors=(OTHERS,)), ranges, 0.3))
     air.program(anchor, attend)

@@ -21,7 +21,7 @@ from uwb_mitigation.training.evaluation.metrics import ErrorStatistics
 
 
 def run(*arguments: object):
-    return CliRunner().invoke(app, [str(value) for value in arguments], catch_exceptions=True)
+    return CliRunner().invoke(app, [str(value) for value in arguments])
 
 
 @pytest.fixture

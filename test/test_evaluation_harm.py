@@ -56,10 +56,9 @@ def louder(decibels: float) -> Callable[[Cir], Cir]:
 DAMAGED = {
     "magnitudes, no preamble count": amplitudes_only,
     "noise": noise,
-    **{f"shifted by {taps}": shifted(taps) for taps in (-30, -10, -5, 30, 80)},
+    **{f"shifted by {taps}": shifted(taps) for taps in (-30, -10, -5, 5, 10, 30, 80)},
     **{f"clipped at {level}": clipped(level) for level in (100, 500, 2000)},
 }
-LATE = {f"shifted by {taps}": shifted(taps) for taps in (5, 10)}
 
 
 def accuracy(mitigation: Mitigation, records: list[Record], change: Callable[[Cir], Cir]) -> Accuracy:
@@ -67,26 +66,23 @@ def accuracy(mitigation: Mitigation, records: list[Record], change: Callable[[Ci
     return evaluate_accuracy(mitigation, [changed(one, change(one.measurement.cir)) for one in records])
 
 
-@pytest.mark.parametrize("name", DAMAGED | LATE)
+@pytest.mark.parametrize("name", DAMAGED)
 def test_changed_cirs_do_not_worsen_ranges(name, mitigation, records, universal, calibrated):
-    change = (DAMAGED | LATE)[name]
     for model, measured in ((mitigation, records), (universal, calibrated)):
-        outcome = accuracy(model, measured, change)
+        outcome = accuracy(model, measured, DAMAGED[name])
         assert outcome.corrected.mae <= 1.02 * outcome.raw.mae
 
 
-@pytest.mark.parametrize("decibels", [-25, -20, -16, -15, -10, -9, -5, 5, 10, 20])
-def test_site_model_does_not_worsen_ranges_of_other_levels(decibels, mitigation, records):
+@pytest.mark.parametrize("decibels", [-25, -20, -16, -15, *range(-14, -8), -5, 5, 10, 20])
+def test_site_model_does_not_worsen_ranges_of_most_other_levels(decibels, mitigation, records):
     outcome = accuracy(mitigation, records, louder(decibels))
-    assert outcome.corrected.mae <= 1.02 * outcome.raw.mae
-
-
-@pytest.mark.parametrize("decibels", [-14, -13, -12, -11])
-def test_weaker_radio_is_made_worse_by_an_eighth_at_most(decibels, mitigation, records):
-    # A single range cannot distinguish a weaker radio in LOS from walls with the same attenuation.
-    outcome = accuracy(mitigation, records, louder(decibels))
-    # If a bundle is better, update the table in docs/background/results.md.
-    assert 1.02 < outcome.corrected.mae / outcome.raw.mae <= 1.12
+    ratio = outcome.corrected.mae / outcome.raw.mae
+    if decibels in (-14, -13, -12, -11):
+        # A single range cannot distinguish a weaker radio in LOS from walls with the same attenuation.
+        # If a bundle is better, update the table in docs/background/results.md.
+        assert 1.02 < ratio <= 1.12
+    else:
+        assert ratio <= 1.02
 
 
 @pytest.fixture(scope="module")

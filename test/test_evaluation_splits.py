@@ -20,7 +20,6 @@ from uwb_mitigation.training.data.dataset import Dataset, build_dataset
 from uwb_mitigation.training.evaluation import zero_shot
 from uwb_mitigation.training.evaluation.intervals import MIN_DEVIATION_M, fit_intervals, fit_scale
 from uwb_mitigation.training.evaluation.metrics import bootstrap_interval, mae_after_rejection
-from uwb_mitigation.training.evaluation.zero_shot import HeldOut
 from uwb_mitigation.types.measurement import CirFault, RadioType, Segment, Truth
 
 NAMES = np.repeat([f"c{number}" for number in range(40)], 5)
@@ -75,13 +74,9 @@ def test_scale_follows_the_size_of_the_predicted_error():
     assert (np.diff(scale) >= 0.0).all()
 
 
-def test_intervals_without_data_are_refused():
-    with pytest.raises(DatasetError):
-        fit_intervals(np.array([np.nan]), np.array([0.0]), np.array(["a"]))
-
-
 def test_record_becomes_a_row():
-    records = [record(seed, f"c{seed}") for seed in range(2)] + [record(2, "c2", rx_power_dbm=-math.inf)]
+    others = {"radio": RadioType.DW3000, "segment": Segment.STS, "channel": 5}
+    records = [record(0, "c0"), record(1, "c1", **others), record(2, "c2", rx_power_dbm=-math.inf)]
     built = build_dataset(records, Preprocessing(157))
     _, expected = window_of(records[1].measurement.cir, Preprocessing(157))
     assert np.array_equal(built.inputs[1], expected)
@@ -90,6 +85,8 @@ def test_record_becomes_a_row():
     assert built.first_path_power_dbm.tolist() == [-88.0] * 3
     assert built.configurations.tolist() == ["c0", "c1", "c2"]
     assert built.labels.tolist() == ["LOS"] * 3
+    assert built.radios == (RadioType.DW1000, RadioType.DW3000)
+    assert (built.segments, built.channels) == ((Segment.IPATOV, Segment.STS), (2, 5))
 
 
 def test_skipped_records_are_counted_by_reason():
@@ -114,6 +111,8 @@ def test_data_without_usable_records_is_refused_with_the_reason():
         build_dataset([replace(record(), truth=None)], Preprocessing(157))
     with pytest.raises(DatasetError, match="no measurements"):
         build_dataset([], Preprocessing(157))
+    with pytest.raises(DatasetError):
+        fit_intervals(np.array([np.nan]), np.array([0.0]), np.array(["a"]))
 
 
 @settings(max_examples=60)
@@ -144,16 +143,6 @@ def test_thinning_keeps_a_maximum_number_per_configuration():
     assert (np.diff(rows) > 0).all()
 
 
-def test_radios_segments_and_channels_of_a_dataset_are_those_of_its_cirs():
-    records = [record(), record(radio=RadioType.DW3000, segment=Segment.STS, channel=5)]
-    dataset = build_dataset(records, Preprocessing(157))
-    assert (dataset.radios, dataset.segments, dataset.channels) == (
-        (RadioType.DW1000, RadioType.DW3000),
-        (Segment.IPATOV, Segment.STS),
-        (2, 5),
-    )
-
-
 @pytest.fixture(scope="module")
 def model(tmp_path_factory) -> Bundle:
     return bundle(tmp_path_factory.mktemp("zero"), linear_bias=LinearBiasModel(0.0))
@@ -164,22 +153,18 @@ def data() -> Dataset:
     return dataset(8, 6)
 
 
-def maes(found: HeldOut) -> list[float]:
-    return [float(np.abs(found.errors[name]).mean()) for name in zero_shot.NAMES]
-
-
-def test_offsets_remove_a_constant_of_the_boards(model, data):
-    moved = zero_shot.evaluate_zero_shot(replace(data, error_m=data.error_m + 3.0), model)
-    still = zero_shot.evaluate_zero_shot(data, model)
-    assert maes(moved)[1:] == pytest.approx(maes(still)[1:])
-    assert maes(moved)[0] > maes(still)[0] + 1.0
-
-
-def test_offset_of_a_placement_is_from_the_other_placements(model, data):
-    odd = data.configurations == data.names[0]
-    moved = zero_shot.evaluate_zero_shot(
-        replace(data, error_m=data.error_m + np.where(odd, 50.0, 0.0)), model
+def test_offsets_remove_a_constant_of_the_boards_but_not_of_the_same_placement(model, data):
+    still, moved = (
+        zero_shot.evaluate_zero_shot(replace(data, error_m=data.error_m + added_m), model)
+        for added_m in (0.0, 3.0)
     )
+    maes, others = (
+        [np.abs(found.errors[name]).mean() for name in zero_shot.NAMES] for found in (still, moved)
+    )
+    assert others[1:] == pytest.approx(maes[1:])
+    assert others[0] > maes[0] + 1.0
+    odd = data.configurations == data.names[0]
+    moved = zero_shot.evaluate_zero_shot(replace(data, error_m=data.error_m + 50.0 * odd), model)
     assert np.abs(moved.errors["universal_offset"][odd]).min() > 45.0
 
 

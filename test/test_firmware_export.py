@@ -11,10 +11,9 @@ import firmware_models
 import model_material
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from command_line import succeed
 
 from benchmarks.equipment import random_networks
-from uwb_mitigation.commands import cli
 from uwb_mitigation.errors import MissingDependencyError, ModelError
 from uwb_mitigation.mitigation.embedded import toolchain
 from uwb_mitigation.mitigation.embedded.export import export_bundle, format_number
@@ -42,16 +41,11 @@ def test_value_that_is_not_a_finite_float32_is_refused(value: float):
 
 
 def test_shipped_model_is_exported_with_its_identity(tmp_path: Path):
-    bundle, folder, result = (
-        load_bundle(default_model_path()),
-        tmp_path / "new" / "folder",
-        tmp_path / "result.json",
-    )
-    done = CliRunner().invoke(cli.app, ["board", "export-c", "-o", str(folder), "--json", str(result)])
-    assert done.exit_code == 0, done.output
+    bundle, result = load_bundle(default_model_path()), tmp_path / "result.json"
+    succeed("board export-c --json result.json -o new/folder", folder=tmp_path)
     values = json.loads(result.read_text())
     assert (values["model_id"], values["k"]) == (bundle.model_id, 157)
-    text = Path(values["header"]).read_text()
+    text = (tmp_path / values["header"]).read_text()
     assert f"0x{bundle.model_id:08x}u" in text
     assert format_number(bundle.linear_bias.per_rx_power) in text
 
@@ -89,18 +83,19 @@ def test_shapes_without_kernels_are_refused(architecture: Remnet, names: str):
 
 def test_weights_and_scales_without_exact_integers_are_refused_by_layer():
     weights = random_networks.remnet(16, 3)
-    scales = weights.weight_scale["module2.skip"].copy()
-    # A requantisation by 1/64: every 64th accumulator is a tie, and ties go to even.
-    unit = weights.activation_scale["module2.skip"] / weights.activation_scale["module2.sum"]
-    scales[5] = unit / np.float32(64)
     larger = weights.weight["module1.residual"].copy()
     larger[3, 2, 1] = -64
-    third = {"module1.sum": weights.activation_scale["first"] / np.float32(3)}
-    for changes, problem in (
-        ({"weight_scale": weights.weight_scale | {"module2.skip": scales}}, r"module2\.skip.*channel 5"),
-        ({"weight": weights.weight | {"module1.residual": larger}}, r"module1\.residual.*7 bits"),
-        ({"activation_scale": weights.activation_scale | third}, r"module1\.sum"),
-    ):
+    cases = [({"weight": weights.weight | {"module1.residual": larger}}, r"module1\.residual.*7 bits")]
+    unit = weights.activation_scale["module2.skip"] / weights.activation_scale["module2.sum"]
+    # By 1/64, every 64th accumulator is a tie, and ties go to even.
+    for ratio in (1 / 64, 1, 0, 1e-12, np.nan):
+        scales = weights.weight_scale["module2.skip"].copy()
+        scales[5] = unit * np.float32(ratio)
+        cases.append(({"weight_scale": weights.weight_scale | {"module2.skip": scales}}, "skip.*channel 5"))
+    for ratio in (3, np.inf, np.nan):
+        third = {"module1.sum": weights.activation_scale["first"] / np.float32(ratio)}
+        cases.append(({"activation_scale": weights.activation_scale | third}, r"module1\.sum"))
+    for changes, problem in cases:
         with pytest.raises(ModelError, match=problem):
             pack(replace(weights, **changes))
 

@@ -35,22 +35,13 @@ pytestmark = NEEDS_CC
 SANITIZED = ("-O1", "-fsanitize=undefined", "-fno-sanitize-recover=all")
 
 
-@pytest.mark.parametrize("shape", firmware_models.SHAPES, ids=firmware_models.shape_name)
-def test_c_and_reference_equal_onnx_runtime(shape: tuple[int, int], tmp_path: Path):
-    exported = firmware_models.exported(shape, tmp_path)
-    windows = exported.windows()
-    expected = bits(exported.subject.expect(windows))
-    assert np.array_equal(bits(IntegerNetwork(exported.weights).predict_m(windows)), expected)
-    assert np.array_equal(bits(CompiledFirmware(tmp_path, tmp_path).predict_m(windows)), expected)
-
-
-@pytest.mark.parametrize(("samples", "modules"), firmware_models.SIZES)
-def test_any_length_and_number_of_modules(samples: int, modules: int, tmp_path: Path):
-    weights = random_networks.remnet(samples, 3, modules)
-    firmware_models.write_model(tmp_path, weights)
-    windows = random_networks.rounding_windows(samples, weights.activation_scale["input"], 40)
-    computed = CompiledFirmware(tmp_path, tmp_path, SANITIZED).predict_m(windows)
-    assert np.array_equal(bits(computed), bits(IntegerNetwork(weights).predict_m(windows)))
+@pytest.mark.parametrize("shape", firmware_models.SHAPES, ids=str)
+def test_c_and_reference_equal_onnx_runtime(shape: tuple[int, int, int], tmp_path: Path):
+    weights, subject, windows = firmware_models.exported(shape, tmp_path)
+    expected = bits(subject.expect(windows))
+    assert np.array_equal(bits(IntegerNetwork(weights).predict_m(windows)), expected)
+    flags = () if shape in firmware_models.PUBLISHED else SANITIZED
+    assert np.array_equal(bits(CompiledFirmware(tmp_path, tmp_path, flags).predict_m(windows)), expected)
 
 
 @pytest.mark.filterwarnings("ignore:overflow")
@@ -80,14 +71,10 @@ def build_program(name: str, export: Path, flags: Sequence[str] = ()) -> str:
 ADDRESS_SANITIZED = ("-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 
 
-def test_golden_vectors_pass_under_the_sanitizers(tmp_path: Path):
-    firmware_models.write_model(tmp_path, random_networks.remnet(64, 5))
+def test_golden_vectors_pass_under_the_sanitizers_and_detect_a_changed_weight(tmp_path: Path):
+    header = firmware_models.write_model(tmp_path, random_networks.remnet(64, 5))
     program = build_program("golden", tmp_path, ADDRESS_SANITIZED)
     assert "0 of 8 golden vectors wrong" in run_tool([program])
-
-
-def test_golden_vectors_detect_a_changed_weight(tmp_path: Path):
-    header = firmware_models.write_model(tmp_path, random_networks.remnet(16, 3))
     text = header.read_text()
     start = text.index("{\n", text.index("uwb_module1_residual_weights[")) + 2
     first = text[start : text.index(",", start)].strip()

@@ -105,32 +105,25 @@ def test_both_nodes_start_with_their_arguments_and_are_respawned(generate):
     assert not any(node.respawn for node in launch(generate, "uwb.launch.py", **overrides, respawn="false"))
 
 
-def test_one_process_accepts_the_arguments_of_both_nodes(generate):
+def test_one_process_and_the_viewer_get_their_arguments(generate):
     overrides = {"source": "serial", "port": "/dev/x", "model": "m.onnx"}
-    (pipeline,) = launch(generate, "uwb.launch.py", **overrides, one_process="true")
+    given = overrides | {"anchors": "a.yaml", "viewer": "true", "one_process": "true"}
+    pipeline, viewer = launch(generate, "uwb.launch.py", **given)
     assert (pipeline.executable, pipeline.name, pipeline.respawn) == ("pipeline", None, True)
     assert settings(pipeline) == overrides | {"use_sim_time": False}
     assert [Path(file).name for file in pipeline.parameters[:2]] == ["driver.yaml", "mitigator.yaml"]
-
-
-def test_viewer_starts_if_requested(generate):
-    overrides = {"source": "simulated", "anchors": "a.yaml", "viewer": "true"}
-    *_, viewer = launch(generate, "uwb.launch.py", **overrides, one_process="true")
     assert (viewer.executable, viewer.name, viewer.respawn) == ("viewer", "viewer", True)
     assert settings(viewer) == {"anchors": "a.yaml", "use_sim_time": False}
-    *_, locator, viewer = launch(generate, "uwb.launch.py", **overrides, locate="true")
-    assert settings(locator)["anchors"] == "a.yaml"
-    assert settings(viewer) == {"use_sim_time": False}, "the locator publishes them"
-    nodes = launch(generate, "uwb.launch.py", source="simulated")
-    assert "viewer" not in [node.executable for node in nodes]
 
 
 def test_displays_and_the_locator_start_without_a_source(generate):
-    given = {"locate": "true", "anchors": "anchors.yaml", "rviz": "true", "foxglove": "True"}
-    rviz, bridge, locator = launch(generate, "uwb.launch.py", **given)
-    assert (rviz.executable, bridge.executable, locator.executable) == ("rviz2", "foxglove_bridge", "locator")
+    displays = {"rviz": "true", "foxglove": "True", "viewer": "true"}
+    nodes = launch(generate, "uwb.launch.py", locate="true", anchors="anchors.yaml", **displays)
+    rviz, _, locator, viewer = nodes
+    assert [node.executable for node in nodes] == ["rviz2", "foxglove_bridge", "locator", "viewer"]
     assert rviz.arguments == ["-d", ["share/uwb_mitigation", "rviz", "uwb.rviz"]]
     assert settings(locator)["anchors"] == "anchors.yaml"
+    assert settings(viewer) == {"use_sim_time": False}, "the locator publishes them"
 
 
 @pytest.mark.parametrize("file", ["uwb.launch.py", "boards.launch.py"])
@@ -185,14 +178,12 @@ def test_every_parameter_is_an_argument_and_reaches_its_node_with_its_type(gener
 @pytest.mark.parametrize("file", ["uwb.launch.py", "boards.launch.py"])
 def test_flags_and_log_level_have_choices_which_launch_checks(generate, file: str):
     arguments, _ = described(generate, file)
-    chosen = {
-        name: argument.choices for name, argument in arguments.items() if getattr(argument, "choices", None)
-    }
-    flags = {name for name, argument in arguments.items() if name not in launching.arguments(TABLES)} & {
-        *("one_process", "locate", "viewer", "rviz", "foxglove", "use_sim_time", "respawn")
-    }
-    assert {name for name, choices in chosen.items() if choices == launching.BOOLEANS} == flags
-    assert chosen["log_level"] == launching.LOG_LEVELS
+    choices = {name: getattr(argument, "choices", None) for name, argument in arguments.items()}
+    flags = {"one_process", "locate", "viewer", "rviz", "foxglove", "use_sim_time", "respawn"}
+    assert {name for name, values in choices.items() if values == launching.BOOLEANS} == flags & set(
+        arguments
+    )
+    assert choices["log_level"] == launching.LOG_LEVELS
 
 
 @pytest.mark.parametrize(
@@ -249,12 +240,8 @@ def test_one_file_configures_all_nodes(generate, tmp_path: Path):
     assert settings(nodes[3])["port"] == 5006
     (pipeline,) = launch(generate, "uwb.launch.py", params=str(robot), one_process="true")
     assert pipeline.parameters[2] == str(robot)
-
-
-def test_file_of_the_driver_sets_its_source(generate, tmp_path: Path):
-    mine = tmp_path / "mine.yaml"
-    mine.write_text(f"driver:\n  ros__parameters:\n    source: mcap\n    path: {tmp_path}\n")
-    driver, _ = launch(generate, "uwb.launch.py", driver_params=str(mine))
+    # The file of the driver sets its source, too.
+    driver, _ = launch(generate, "uwb.launch.py", driver_params=str(robot))
     assert settings(driver) == {"use_sim_time": False}
 
 

@@ -7,6 +7,7 @@ import logging
 import signal
 import socket
 import time
+import tracemalloc
 import zipfile
 from functools import partial
 from pathlib import Path
@@ -24,8 +25,7 @@ from uwb_mitigation.commands import cli
 from uwb_mitigation.errors import DamagedRecordingError, RecordingError
 from uwb_mitigation.nodes.support.parameter_tables import RESPAWN_FOLDER
 from uwb_mitigation.radios import lines, uci
-from uwb_mitigation.radios.lines import LineSession, LineSettings, UdpAddress
-from uwb_mitigation.radios.port import PortAddress
+from uwb_mitigation.radios.lines import LineSession
 from uwb_mitigation.radios.settings import PortMessage
 from uwb_mitigation.recordings.mapping.mapped import MappedRecording
 from uwb_mitigation.recordings.mapping.mapping import FieldRule, Mapping, load_mapping
@@ -54,23 +54,23 @@ def session_of(name: str, number: int = 0) -> LineSession:
 # Lines -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("line", [LEC, LES, f"dwm> {LES}", LEC.partition(",POS")[0]])
-def test_both_shell_commands_of_a_dwm1001_are_read(line: str):
-    assert read(session_of("dwm1001_pans"), line + "\r\n") == [(1, 0x022E, 3.44), (1, 0x9280, 15.68)]
+FIRST, SECOND = (0x022E, 3.44), (0x9280, 15.68)
 
 
 @pytest.mark.parametrize(
     ("line", "ranges"),
     [
-        (LEC.replace("15.68", "15.6"), [(1, 0x022E, 3.44)]),
-        (LEC.replace("3.44", "344"), [(1, 0x9280, 15.68)]),
-        (LEC[:70] + LEC, [(1, 0x022E, 3.44), (1, 0x022E, 3.44), (1, 0x9280, 15.68)]),
-        (LEC.replace("022E,", "022E"), [(1, 0x9280, 15.68)]),
+        *((line, [FIRST, SECOND]) for line in (LEC, LES, f"dwm> {LES}", LEC.partition(",POS")[0])),
+        (LEC.replace("15.68", "15.6"), [FIRST]),
+        (LEC.replace("3.44", "344"), [SECOND]),
+        (LEC[:70] + LEC, [FIRST, FIRST, SECOND]),
+        (LEC.replace("022E,", "022E"), [SECOND]),
         ("POS,6.95,5.37,-1.97,52", []),
     ],
 )
-def test_cut_and_mixed_lines_give_no_wrong_range(line: str, ranges: list[tuple[int, int, float]]):
-    assert read(session_of("dwm1001_pans"), line + "\n") == ranges
+def test_shell_commands_of_a_dwm1001_are_read_and_cut_lines_give_no_wrong_range(line: str, ranges: list):
+    # Without an id of its own, a board has the number of its port.
+    assert read(session_of("dwm1001_pans", 2), line + "\r\n") == [(3, *found) for found in ranges]
 
 
 def test_a_timeout_of_the_cli_image_is_counted_and_not_a_range():
@@ -83,13 +83,8 @@ def test_a_timeout_of_the_cli_image_is_counted_and_not_a_range():
     assert session.counts["lines that do not match"] == 0
 
 
-def test_boards_without_an_own_id_are_different_tags():
-    assert read(session_of("dwm1001_pans", 2), LEC + "\n")[0] == (3, 0x022E, 3.44)
-    assert read(session_of("string_json", 2), f"{GOOD}\n") == [(7, 1, 4.31)]
-
-
 def test_hostile_bytes_are_counted_and_the_next_line_is_read():
-    session = session_of("string_json")
+    session = session_of("string_json", 2)
     good = f"{GOOD}\n"
     hostile = [b"\xff\xfe\x00\x01", b"[" * 60_000, b"x" * 300_000, b"9" * 5000, b'"x"', b"null"]
     hostile += [good[:30].encode()]
@@ -103,7 +98,12 @@ def test_hostile_bytes_are_counted_and_the_next_line_is_read():
     assert session.counts["range is not a number"] + session.counts["range is above 10000"] == len(values)
     assert (session.counts["lines that do not match"], session.counts["lines that are too long"]) == (9, 1)
     assert session.example.startswith('\'{"tag": 1, "ranges": [')
-    assert len(session._incomplete) <= lines.MAX_LINE
+    tracemalloc.start()
+    for _ in range(100):
+        assert read(session, b"x" * lines.MAX_LINE) == []
+    held, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert held < 3 * lines.MAX_LINE, "the rest of an endless line"
 
 
 @pytest.mark.parametrize("name", MAPPINGS.values())
@@ -145,22 +145,12 @@ def test_a_log_and_a_live_port_give_the_same_ranges(tmp_path: Path):
     assert log.anchors.anchors[log.anchors.index[0x9280]].position == (7.95, 0.0, -1.2)
 
 
-# Settings --------------------------------------------------------------------------------------------------------
-
-
-def test_settings():
-    first, second = lines.read_settings(value_of(port="/dev/a,udp:10.0.0.1:8000", map="string_at"))
-    assert (first.address, first.baud) == (PortAddress("/dev/a"), 115_200)
-    assert str(second.address) == "udp:10.0.0.1:8000"
-    (board,) = lines.read_settings(value_of(source="pans", port="/dev/a"))
-    assert board.mapping.name == "DWM1001 PANS"
-
-
 # Ports -----------------------------------------------------------------------------------------------------------
 
 
-def open_board(path: Path, kind: str, **settings: object) -> PortEvents:
-    return PortEvents(lines, LineSettings(PortAddress(str(path)), load_mapping(MAPPINGS[kind]), **settings))
+def open_board(port: Path | str, kind: str, capture: Path | str = "") -> PortEvents:
+    values = value_of(port=str(port), map=MAPPINGS[kind], capture=str(capture))
+    return PortEvents(lines, *lines.read_settings(values))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -181,29 +171,14 @@ def test_a_board_vanishes_and_returns(tmp_path: Path, kind: str):
         wait_until(lambda: events.port.report().warning == "")
 
 
+@pytest.mark.parametrize(("options", "silent_s"), [({}, 0.0), ({"banner": ""}, 5.0)], ids=["banner", "none"])
 @pytest.mark.parametrize("state", ["generic", "shell", "lec", "les"])
-def test_the_output_of_a_dwm1001_is_on_in_whatever_state_it_was(tmp_path: Path, state: str):
-    with TextBoards(links=tmp_path / "b", rate_hz=50.0) as boards:
-        shell = boards.shells[0]
-        if state != "generic":
-            shell.receive(b"\r\r", 0.0)
-            shell.output = state if state != "shell" else ""
-        with open_board(tmp_path / "b0", "pans") as events:
-            events.wait_for(RangeMeasurement, 8)
-            # It stays on: a second `lec` would turn it off.
-            events.wait_for(RangeMeasurement, 100)
-            assert events.port.session.counts["starts of the output"] == (state in ("generic", "shell"))
-            boards.reset(0)
-            events.wait_for(RangeMeasurement, 400)
-            assert boards.shells[0].output == "lec"
-
-
-@pytest.mark.parametrize("output", ["", "lec"])
-def test_the_start_of_the_output_needs_neither_a_banner_nor_a_known_state(output: str):
-    """In virtual time: a shell without banner, silent at first, whose output someone turns off, after more than a minute."""
-    session, shell, now_ns = LineSession(load_mapping("dwm1001_pans")), PansShell(banner=""), 0
-    shell.receive(b"\r\r", 0.0)
-    shell.output = output
+def test_the_output_of_a_dwm1001_is_on_in_whatever_state_it_was(state: str, options: dict, silent_s: float):
+    """In virtual time: possibly silent at first; later someone turns its output off; then it is reset."""
+    session, shell, now_ns = LineSession(load_mapping("dwm1001_pans")), PansShell(**options), 0
+    if state != "generic":
+        shell.receive(b"\r\r", 0.0)
+        shell.output = state if state != "shell" else ""
     session.opened(0)
 
     def run(seconds: float, line: str = f"{LEC}\r\n") -> list[RangeMeasurement]:
@@ -215,13 +190,17 @@ def test_the_start_of_the_output_needs_neither_a_banner_nor_a_known_state(output
             ranges += session.receive(answer + (line.encode() if shell.output else b""), now_ns, now_ns)
         return ranges
 
-    run(5.0, line="")
+    run(silent_s, line="")
     assert len(run(10.0)) > 100
+    if silent_s == 0.0:
+        assert session.counts["starts of the output"] == (state in ("generic", "shell"))
     run(10.0, line="")
-    assert shell.output == "lec", "the output of a tag that is silent for a while is not turned off"
+    assert shell.output, "the output of a tag that is silent for a while is not turned off"
     shell.output = ""
     assert len(run(40.0)) == 0
     assert len(run(40.0)) > 20
+    shell = PansShell(**options)
+    assert len(run(80.0)) > 20
 
 
 def test_a_board_without_ranges_is_explained(tmp_path: Path):
@@ -240,17 +219,17 @@ def test_a_board_without_ranges_is_explained(tmp_path: Path):
 def test_datagrams_are_received(tmp_path: Path):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
-        place = host, number = probe.getsockname()
-    settings = LineSettings(UdpAddress(host=host, number=number), load_mapping("string_json"))
-    with TextBoards("json", udp=place, rate_hz=50.0), PortEvents(lines, settings) as events:
+        place = probe.getsockname()
+    port = f"udp:{place[0]}:{place[1]}"
+    with TextBoards("json", udp=place, rate_hz=50.0), open_board(port, "json") as events:
         events.wait_for(RangeMeasurement, 8)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             for data in (b"", b"\xff" * 60_000, b'{"tag": 9, "ranges": [{"anchor": 3, "range_m": 1.5}]}'):
                 sender.sendto(data, place)
         (measured,) = events.wait_for(lambda event: getattr(event, "tag_id", 0) == 9)
         assert (measured.range_m, events.port.openings) == (1.5, 1)
-        with PortEvents(lines, settings) as second:
-            wait_until(lambda: "Address already in use" in second.port.problem)
+        with open_board(port, "json") as second:
+            wait_until(lambda: f"{port}: cannot be opened: Address already in use" in second.port.problem)
 
 
 def test_a_capture_replays_the_ranges_also_with_another_mapping(tmp_path: Path):
@@ -273,10 +252,8 @@ def test_a_full_disk_ends_the_capture_but_not_the_ranges(tmp_path: Path):
     boards = TextBoards(links=tmp_path / "b", rate_hz=50.0)
     with boards, open_board(tmp_path / "b0", "pans", capture=Path("/dev/full")) as events:
         (message,) = events.wait_for(lambda event: "capture" in getattr(event, "text", ""))
-        assert (message.level, message.text) == (
-            logging.ERROR,
-            "the capture has ended: No space left on device",
-        )
+        text = "the capture has ended: No space left on device"
+        assert (message.level, message.text) == (logging.ERROR, text)
         events.wait_for(RangeMeasurement, 3)
         assert events.port.openings == 1
 

@@ -11,7 +11,7 @@ from benchmarks.equipment.board import Board
 from uwb_mitigation.radios.settings import PortMessage, RadioSettings
 from uwb_mitigation.radios.wire import messages
 from uwb_mitigation.radios.wire.events import Event, LinkState, Loss, Refused
-from uwb_mitigation.radios.wire.framing import FrameDecoder, FrameEncoder, WireFrame, encode_frame
+from uwb_mitigation.radios.wire.framing import FrameDecoder, FrameEncoder, WireFrame
 from uwb_mitigation.radios.wire.layout import MAX_OFFSETS, Flag, LogLevel, MessageType, Mode
 from uwb_mitigation.radios.wire.messages import BoardStatus, Correction, Hello, Log
 from uwb_mitigation.radios.wire.session import BoardSession
@@ -93,20 +93,15 @@ def test_messages_before_hello_are_counted_and_a_request_connects():
     assert (bench.session.hello.firmware_name, bench.session.hello.window) == ("simulated", 157)
 
 
-def test_measurement_arrives_with_its_stamp_on_the_nodes_clock():
-    bench = connected()
+@pytest.mark.parametrize(("mode", "kind"), [(Mode.HOST, RangeMeasurement), (Mode.DEVICE, Correction)])
+def test_each_mode_sends_its_messages_which_get_stamps_of_the_nodes_clock(mode, kind):
+    bench = connected(mode=mode)
     took_place = EPOCH + bench.now
 
     (event,) = bench.measure(5, late_ns=30 * MS)
 
-    assert event.sequence == 5
-    assert event.range_m == 4.0
+    assert (type(event), event.sequence) == (kind, 5)
     assert event.stamp_ns == pytest.approx(took_place, abs=0.1 * MS)
-
-
-@pytest.mark.parametrize(("mode", "kind"), [(Mode.HOST, RangeMeasurement), (Mode.DEVICE, Correction)])
-def test_each_mode_sends_its_messages(mode, kind):
-    assert [type(event) for event in connected(mode=mode).measure(1)] == [kind]
 
 
 def test_lost_request_for_a_mode_is_repeated():
@@ -118,34 +113,26 @@ def test_lost_request_for_a_mode_is_repeated():
     assert bench.received(PortMessage) == [PortMessage(logging.INFO, "the board is in mode DEVICE")]
 
 
-def test_board_without_a_model_refuses_to_correct_and_is_asked_once():
-    bench = Bench(BoardSession(mode=Mode.DEVICE))
+class Correcting(Board):
+    mode = property(lambda board: Mode.DEVICE, lambda board, value: None)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "board", "corrector", "modes"),
+    [
+        (Mode.DEVICE, Board, None, "HOST instead of DEVICE"),
+        (Mode.HOST, Correcting, HalfMetre(), "DEVICE instead of HOST"),
+    ],
+    ids=["without a model", "another firmware"],
+)
+def test_board_that_keeps_its_mode_is_asked_and_reported_once(wanted, board, corrector, modes):
+    bench = Bench(BoardSession(mode=wanted))
+    bench.board = board(IDENTITY, corrector)
     bench.run(3000)
 
     (refused,) = bench.received(PortMessage)
-    assert refused.text.startswith("the board stays in mode HOST instead")
-    assert [type(event) for event in bench.measure(1)] == [RangeMeasurement]
-
-
-def test_board_that_keeps_its_mode_is_reported_as_refusing():
-    class Correcting(Board):
-        mode = property(lambda board: Mode.DEVICE, lambda board, value: None)
-
-    bench = Bench(BoardSession(mode=Mode.HOST))
-    bench.board = Correcting(IDENTITY, HalfMetre())
-    bench.run(1000)
-
-    (refused,) = bench.received(PortMessage)
-    assert "stays in mode DEVICE instead of HOST" in refused.text
-
-
-def test_mode_is_requested_again_after_a_reset():
-    bench = connected(mode=Mode.DEVICE)
-    bench.reboot()
-    bench.host_hears(bench.board.hello(0))
-    bench.run(600)
-
-    assert bench.board.mode is Mode.DEVICE
+    assert refused.text.startswith(f"the board stays in mode {modes}")
+    assert len(bench.measure(1)) == 1
 
 
 def test_corrections_by_another_model_than_expected_are_withheld():
@@ -187,24 +174,20 @@ def test_board_times_out_after_3_s_and_reconnects():
     assert bench.session.state is LinkState.READY
 
 
-def test_status_once_a_second_keeps_a_board_without_measurements_connected():
-    bench = connected()
-    bench.run(20_000)
-
-    assert bench.received(Loss) == []
-    assert len(bench.received(BoardStatus)) >= 19
-
-
-def test_boot_id_reveals_a_reset_and_restarts_the_clock():
-    bench = connected()
+def test_boot_id_reveals_a_reset_after_which_clock_and_mode_are_set_again():
+    bench = connected(mode=Mode.DEVICE)
     bench.run(10_000)
+    # A status once a second keeps a board without measurements connected.
+    assert len(bench.received(BoardStatus)) >= 10
     bench.reboot()
     bench.host_hears(bench.board.hello(0))
 
     assert bench.events[-2:] == [Loss.RESET, bench.received(Hello)[-1]]
+    assert len(bench.received(Loss)) == 1
     bench.run(1000)
     took_place = EPOCH + bench.now
     (event,) = bench.measure(1, late_ns=20 * MS)
+    assert isinstance(event, Correction)
     assert event.stamp_ns == pytest.approx(took_place, abs=0.1 * MS)
 
 
@@ -222,30 +205,28 @@ def test_frame_numbers_reveal_a_reset_whose_hello_is_lost():
     assert bench.session.state is LinkState.READY
 
 
-def test_missing_frames_are_counted():
+def test_missing_frames_are_counted_and_a_repeated_one_is_delivered_once():
     bench = connected()
     bench.measure(1)
     for lost in range(4):
         bench.board.measure(measurement(lost), 0)
-
-    assert len(bench.measure(6)) == 1
-    assert bench.session.counts["lost"] == 4
-
-
-def test_repeated_frame_is_delivered_once():
-    bench = connected()
-    data = bench.board.measure(measurement(1), bench.uptime_us)
+    data = bench.board.measure(measurement(6), bench.uptime_us)
 
     assert len(bench.host_hears(data + data)) == 1
-    assert bench.session.counts["stale"] == 1
+    assert (bench.session.counts["lost"], bench.session.counts["stale"]) == (4, 1)
+
+
+def connected_to(bench: Bench, first: int = 0) -> FrameEncoder:
+    """Replace the board by another one, whose HELLO has the given frame number; return its encoder."""
+    encoder = FrameEncoder()
+    encoder.sequence = first
+    bench.host_hears(encoder.encode(*messages.encode(Hello(0xB0, boot_id=9))))
+    return encoder
 
 
 def test_frame_numbers_wrap():
     bench = connected()
-    encoder = FrameEncoder()
-    encoder.sequence = 2**32 - 1
-    hello = messages.Hello(0xB0, 0, 0, Mode.HOST, boot_id=9)
-    bench.host_hears(encoder.encode(*messages.encode(hello)))
+    encoder = connected_to(bench, 2**32 - 1)
 
     events = bench.host_hears(encoder.encode(*messages.encode(Log(LogLevel.INFO, "wrapped"))))
 
@@ -268,10 +249,10 @@ CORRECTION = Correction(0, 1, 2, 3, 4, HalfMetre().correct([measurement(1)])[0])
 )
 def test_frames_that_are_not_delivered_are_counted(kind, flags, payload, counted):
     bench = connected()
+    encoder = connected_to(bench)
     before = bench.session.totals()
-    frame = WireFrame(int(kind), flags, bench.session._next_sequence, 0, payload)
 
-    assert bench.host_hears(encode_frame(frame)) == []
+    assert bench.host_hears(encoder.encode(int(kind), payload, flags=flags)) == []
     after = bench.session.totals()
     rejections = ("unknown_type", "malformed", "unsolicited", "stale", "withheld", "lost")
     assert {name: 1 for name in rejections if after[name] != before[name]} == counted
@@ -289,10 +270,10 @@ def test_send_queue_is_bounded():
 
 def test_reopening_the_port_ends_the_connection_and_discards_a_partial_frame():
     bench = connected()
-    kind, payload = messages.encode(messages.RadioConfigured(RadioSettings()))
-    bench.host_hears(bench.board._encoder.encode(kind, payload))
+    encoder = connected_to(bench)
+    bench.host_hears(encoder.encode(*messages.encode(messages.RadioConfigured(RadioSettings()))))
     assert bench.session.radio is not None
-    data = bench.board.measure(measurement(1), bench.uptime_us)
+    data = encoder.encode(*messages.encode(measurement(1)))
     bench.host_hears(data[:100])
 
     assert bench.session.opened(bench.now) == [Loss.CLOSED]

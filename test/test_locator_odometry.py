@@ -339,6 +339,8 @@ def test_respawned_locator_continues_with_transform_and_heading(
     latest = [message.transforms[0].transform for message in live.transforms[-20:]]
     live.transforms.clear()
     start(ros, anchors, *parameters)
+    # The transform is repeated once, because this clock stands still: the subscription of it must be connected.
+    ros.wait_until_active("locator")
     # Before any message arrives.
     now = live.header(18 * NANOSECONDS)
     ros.spin_until(lambda: clock.publish(Clock(clock=now.stamp)) or bool(live.transforms))
