@@ -35,6 +35,7 @@ from uwb_mitigation.viewer.histories import (
     Rows,
     Sample,
     Trace,
+    new_outages,
 )
 from uwb_mitigation.viewer.incidents import Incidents
 from uwb_mitigation.viewer.palette import TrackKind
@@ -42,6 +43,7 @@ from uwb_mitigation.viewer.palette import TrackKind
 # Limits. Ids and texts come from the air or the network; above a limit, the oldest entries are removed.
 MAX_PAIRS, MAX_TAGS, MAX_NODES = 256, 64, 64
 MAX_TRACK = 3000  # points
+MAX_OUTAGES = 1000  # of the reading of ranges
 MAX_TEXT = 400  # characters of a name or a message
 MAX_COORDINATE_M = 2e7  # any position on Earth; a position further away is ignored
 
@@ -151,9 +153,10 @@ class Scene:
 
     def clear(self) -> None:
         """Remove everything except the anchors."""
-        self.incidents = Incidents(None) if self.is_whole else Incidents()
+        self.incidents = Incidents()
         # Stamps of different tags may come from different clocks.
         self.latest_stamps: BoundedDict[int, tuple[float, float]] = BoundedDict(MAX_TAGS)
+        self._outages: BoundedDict[int, Rows] = BoundedDict(MAX_TAGS)
         self.ranges = self.corrected = self.faults = self.dropped = 0
         self.pairs: BoundedDict[Pair, History] = BoundedDict(math.inf if self.is_whole else MAX_PAIRS)
         self.tags: BoundedDict[str, Pose] = BoundedDict(MAX_TAGS)
@@ -205,7 +208,10 @@ class Scene:
     def history(self, pair: Pair) -> History:
         """Return the history of a pair, a new one for a new pair."""
         self.revision += 1
-        return self.pairs.add(pair, self.pairs.get(pair) or History())
+        return self.pairs.add(pair, self.pairs.get(pair) or History(outages=self._outages_of(pair[1])))
+
+    def _outages_of(self, tag_id: int) -> Rows:
+        return self._outages.add(tag_id, self._outages.get(tag_id) or new_outages())
 
     def add_sample(self, pair: Pair, sample: Sample) -> None:
         """Add a corrected range.
@@ -232,6 +238,8 @@ class Scene:
         if self.is_whole:
             history.add(sample, self.received_s, math.nan, None)
         else:
+            end_s = self._outages_of(tag_id).rows[-1:, 1]
+            end_s[:] = np.minimum(end_s, max(stamp_s, tag_latest_s))
             history.add(sample, self.received_s, self._compare_with_position(pair, sample), MAX_SAMPLES)
             history.remove_before(tag_latest_s - HISTORY_S)
         if not math.isnan(sample.true_m):
@@ -375,13 +383,17 @@ class Scene:
     def count_dropped(self, number: int) -> None:
         """Count ranges that the viewer itself has dropped; they do not count as lost."""
         self.dropped += number
-        for history in self.pairs.values():
-            history.is_interrupted = True
+        for tag_id, (stamp_s, _) in self.latest_stamps.items():
+            outages = self._outages_of(tag_id)
+            if not np.isinf(outages.rows[-1:, 1]).any():
+                outages.append((stamp_s, math.inf), MAX_OUTAGES)
 
     def clear_history(self, tag_id: int) -> None:
         """Remove the last minute of the pairs of a tag, but not the counts."""
         self.latest_stamps.pop(tag_id, None)
-        self.pairs.update({pair: History() for pair in self.pairs if pair[1] == tag_id})
+        self._outages.pop(tag_id, None)
+        outages = self._outages_of(tag_id)
+        self.pairs.update({pair: History(outages=outages) for pair in self.pairs if pair[1] == tag_id})
 
     def latest(self) -> Iterator[tuple[Pair, History, Sample]]:
         """Yield every pair with its last range, by anchor and tag; also pairs that have stopped."""

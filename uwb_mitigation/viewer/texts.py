@@ -175,11 +175,16 @@ class Texts:
 
     def _incidents(self, scene: Scene) -> list[tuple[float | None, str]]:
         """Return the incidents: time in the recording, None if they are live; text."""
-        if self._view.player is not None:
-            return [] if self._view.timeline is None else sorted(self._view.all_data.incidents.found)
-        scene.incidents.check(now_s := scene.clock())
-        latest = list(scene.incidents.found)[-MAX_SHOWN_EVENTS:]
-        return [(None, f"{now_s - time_s:.0f} s ago: {text}") for time_s, text in latest]
+        if self._view.player is not None and self._view.timeline is None:
+            return []
+        incidents, now_s = self._view.all_data.incidents, scene.clock()
+        shown: list[tuple[float | None, str]] = list(incidents.latest)
+        if self._view.player is None:
+            incidents.check(now_s)
+            ages = incidents.latest[-MAX_SHOWN_EVENTS:]
+            shown = [(None, f"{now_s - time_s:.0f} s ago: {text}") for time_s, text in ages]
+        hidden = incidents.count - len(shown)
+        return [(None, f"{hidden} earlier events are not shown"), *shown] if hidden else shown
 
 
 def _tag_rows(scene: Scene, pairs: dict[Pair, Means], verdicts: dict[int | None, Verdict]) -> list[list[str]]:
