@@ -118,6 +118,9 @@ class RangeColumns(NamedTuple):
     sequence: Column
 
 
+STAMP = RangeColumns._fields.index("stamp_s")
+
+
 class Sample(NamedTuple):
     """One corrected range of a pair; see `RangeColumns`, whose last fields these are."""
 
@@ -186,7 +189,8 @@ class History(Rows):
     @property
     def is_interrupted(self) -> bool:
         """Whether the viewer itself has dropped ranges since the last one: the time until the next one is no interval."""
-        return bool((self._outages.rows[-1:, 1] > self.columns.stamp_s[-1:]).any())
+        outages = self._outages.rows
+        return len(outages) > 0 and bool(outages[-1, 1] > self.latest_stamp_s)
 
     @property
     def columns(self) -> RangeColumns:
@@ -201,10 +205,14 @@ class History(Rows):
         sample = Sample(*self._data[self._end - 1, -len(Sample._fields) :].tolist())
         return sample._replace(status=Status(int(sample.status)))
 
+    @property
+    def latest_stamp_s(self) -> float:
+        """Stamp of the last range; NaN: there is none."""
+        return float(self._data[self._end - 1, STAMP]) if self._end > self._begin else math.nan
+
     def add(self, sample: Sample, received_s: float, residual_m: float, limit: int | None) -> None:
         """Add a range; see `RangeColumns` and `append`."""
-        latest = None if self.is_interrupted else self.latest
-        interval_s = math.nan if latest is None else sample.stamp_s - latest.stamp_s
+        interval_s = math.nan if self.is_interrupted else sample.stamp_s - self.latest_stamp_s
         self.append((received_s, residual_m, interval_s, *sample), limit)
 
     def remove_before(self, stamp_s: float) -> None:
@@ -239,7 +247,7 @@ class History(Rows):
             return math.nan
         polls = np.where(is_step, np.rint(steps / np.median(steps[is_step & is_interval])), 1.0).clip(1.0)
         number, margin_s = np.append(0.0, np.cumsum(polls)), 0.5 * np.median(interval_s[is_interval])
-        outages_s = self._outages.rows.T + [[-margin_s], [margin_s]]
+        outages_s = self._outages.rows.T + np.array([[-margin_s], [margin_s]])
         outages_s[1, :-1] = np.minimum(outages_s[1, :-1], outages_s[0, 1:])
         numbers = np.ceil(np.interp(outages_s, stamp_s, number, right=number[-1] + 1.0))
         polled = number[-1] + 1.0 - np.diff(numbers, axis=0).sum()

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import heapq
 import math
+from bisect import insort
 from dataclasses import dataclass
 
 from uwb_mitigation.errors import format_id
@@ -36,26 +36,20 @@ class Incidents:
 
     Attributes:
         count: number of incidents.
+        latest: time (s) and text of the latest `MAX_EVENTS`, in the order of time.
     """
 
     def __init__(self) -> None:
-        self.count, self._latest = 0, list[tuple[float, str]]()
+        self.count, self.latest = 0, list[tuple[float, str]]()
         # A tag comes before its anchors.
         self._sources: BoundedDict[tuple[int | None, int | str], _Source] = BoundedDict(MAX_SOURCES)
         self._check_s = -math.inf
 
-    @property
-    def latest(self) -> list[tuple[float, str]]:
-        """Time (s) and text of the latest `MAX_EVENTS` incidents, in the order of time."""
-        return sorted(self._latest)
-
     def add(self, time_s: float, text: str) -> None:
         """Add an incident."""
         self.count += 1
-        if len(self._latest) < MAX_EVENTS:
-            heapq.heappush(self._latest, (time_s, text))
-        else:
-            heapq.heappushpop(self._latest, (time_s, text))
+        insort(self.latest, (time_s, text))
+        del self.latest[:-MAX_EVENTS]
 
     def add_range(self, pair: Pair, time_s: float, stamp_s: float) -> None:
         """Add a range at a time; `stamp_s` is on the clock of its tag."""

@@ -144,8 +144,8 @@ class Texts:
 
     def _facts(self, scene: Scene, accuracy: str) -> str:
         """Return accuracy and age, and a line for each other interval: what the correction changes, share of corrected ranges."""
-        tag_id, texts = self._page.tag_id, [accuracy] if accuracy else []
-        if tag_id is not None and math.isfinite(stamp_s := scene.latest_stamp_s(tag_id)):
+        texts = [accuracy] if accuracy else []
+        if math.isfinite(stamp_s := scene.latest_stamp_s(self._page.tag_id)):
             texts.append(f"last range {scene.stamp_clock() - stamp_s:.1f} s old by stamp")
         if scene.dropped:
             texts.append(f"{scene.dropped} ranges dropped by the viewer")
@@ -175,8 +175,6 @@ class Texts:
 
     def _incidents(self, scene: Scene) -> list[tuple[float | None, str]]:
         """Return the incidents: time in the recording, None if they are live; text."""
-        if self._view.player is not None and self._view.timeline is None:
-            return []
         incidents, now_s = self._view.all_data.incidents, scene.clock()
         shown: list[tuple[float | None, str]] = list(incidents.latest)
         if self._view.player is None:
