@@ -137,8 +137,8 @@ def test_rates_and_losses_are_correct_at_1000_ranges_per_second(ros: ros_harness
             while number < 1000 * (time.monotonic() - began_s):
                 message.anchor_id, message.tag_id = number % 30, number // 30 % 5
                 message.sequence = number
-                # The range of one exchange in ten was lost by the radio.
-                if number // 150 % 10 != 3:
+                # One range in ten of each pair was lost by the radio.
+                if (number + number // 150) % 10 != 3:
                     stamp = number + 1_000_000
                     message.header.stamp.sec, message.header.stamp.nanosec = (
                         stamp // 1000,
@@ -155,11 +155,15 @@ def test_rates_and_losses_are_correct_at_1000_ranges_per_second(ros: ros_harness
             found = re.search(r"of (\d+) ranges", browser.text())
             return int(found[1]) if found else 0
 
-        # On a busy machine, the viewer drops many, and they must not count as lost by the radio.
+        # As on a busy machine, the viewer drops many, and they must not count as lost by the radio.
+        while "ranges dropped by the viewer" not in browser.text():
+            for number in (signal.SIGSTOP, signal.SIGCONT):
+                viewer.send(number)
+                time.sleep(1.5)
         browser.wait("30 ranges of each pair", lambda: received() > 30 * 150)
         rates, lost = browser.column("pairs", "rate"), browser.column("pairs", "lost")
     finally:
         stop.set()
         thread.join()
     assert rates == pytest.approx([6.0] * 150, abs=0.7)
-    assert lost == pytest.approx([10.0] * 150, abs=6.0), "two of 30 ranges"
+    assert sum(lost) / 150 == pytest.approx(10.0, abs=2.0), "a pair has only 30 ranges"

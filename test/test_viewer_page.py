@@ -297,7 +297,7 @@ def test_long_names_and_ids_fit_the_screen(browser: Browser, view: View, server:
         view.scene.set_anchors([Anchor(n, (4.0 * n, 0, 2), name=name) for n in (1, 2)])
         view.scene.set_node_status(name, NodeStatus(1, name, determinations=(f"{name}: {name}",)))
         view.scene.add_pose(name, Pose(4.0, 3.0, 1.0, stamp_s=1000.0))
-        view.scene.incidents.found.append((0.0, name))
+        view.scene.incidents.add(0.0, name)
     open_page(browser, server, 1280, 2000)
     browser.wait("the names", lambda: name in browser.text())
     for width in (1280, 1024, 400):

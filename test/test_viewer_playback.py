@@ -99,7 +99,7 @@ def test_seek_shows_data_up_to_the_position(bag: Path):
         before = last - 1
         expected = {(1 + number % 2, 7): 4.25 + number for number in (before, last) if number >= 0}
         assert latest(scene) == expected
-        assert scene.now_s() == pytest.approx((START_NS + last * STEP_NS) / 1e9)
+        assert scene.now_s(7) == pytest.approx((START_NS + last * STEP_NS) / 1e9)
         assert {key: len(track.rows) for key, track in scene.tracks.items()} == {
             ("tag", TrackKind.CORRECTED): last // 10 + 1,
             ("tag_9", TrackKind.CORRECTED): last // 10 + 1,

@@ -35,6 +35,7 @@ from uwb_mitigation.viewer import health
 from uwb_mitigation.viewer.figures import MAX_POINTS, thinned
 from uwb_mitigation.viewer.headline import Positions
 from uwb_mitigation.viewer.histories import Sample
+from uwb_mitigation.viewer.incidents import MAX_EVENTS
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.playback import BagPlayer, Check
 from uwb_mitigation.viewer.recording import add_residuals
@@ -254,10 +255,26 @@ def test_thinned_line_is_interrupted_only_by_gaps():
     assert np.isnan(line[:, 1]).sum() == 1
 
 
-def test_radio_without_cirs_has_no_bad_ranges(tmp_path: Path):
+def test_recording_without_cirs_has_no_bad_ranges_and_says_what_is_missing(tmp_path: Path):
     path = corrected_bag(tmp_path / "radio.mcap", range(60), status=Status.NO_CIR)
-    marks = Drawn(indexed(path)).controls.marks
-    assert (marks["bad"], marks["count"]) == ([], 0)
+    page = Drawn(indexed(path))
+    assert (page.controls.marks["bad"], page.controls.marks["count"]) == ([], 0)
+    page.send("seek", 1.0)
+    assert page.controls.empty["cir"].startswith("No CIRs: the source sends none")
+    assert page.cards()["Correction, whole recording"] == ("none", "the radio sends no CIRs")
+    assert np.isnan(page.column("pairs", "nlos")).all()
+
+
+def test_latest_events_of_a_recording_are_shown_and_the_others_counted(bag: Path):
+    view = indexed(bag)
+    hidden = view.all_data.incidents.count + 10
+    for number in reversed(range(MAX_EVENTS + 10)):
+        view.all_data.incidents.add(100.0 + number, str(number))
+    controls = Drawn(view).controls
+    first, *shown = controls.incidents
+    assert first == (None, f"{hidden} earlier events are not shown")
+    assert shown == [(100.0 + number, str(number)) for number in range(10, MAX_EVENTS + 10)]
+    assert len(controls.marks["incidents"]) == MAX_EVENTS
 
 
 def test_strip_shows_the_minute_before_the_position(tmp_path: Path):

@@ -111,6 +111,21 @@ def test_ranges_that_the_viewer_drops_change_neither_rate_nor_losses() -> None:
     assert history.rate_hz(age_s=2.0) == pytest.approx(10.0)
 
 
+def test_share_of_lost_ranges_is_that_of_the_radio_although_the_viewer_drops_half() -> None:
+    rng, scene = np.random.default_rng(1), Scene()
+    for number in range(30 * 400):
+        # The radio loses one in ten; each second, the viewer drops those of half a second.
+        if rng.random() < 0.1:
+            continue
+        if number % 200 < 100:
+            scene.count_dropped(1)
+        else:
+            sample = Sample(1000.0 + number / 200, 5.3, 5.1, 0.1, Status.OK, sequence=number)
+            scene.add_sample((number % 30, 7), sample)
+    lost = [history.statistics()["lost"] for history in scene.pairs.values()]
+    assert np.mean(lost) == pytest.approx(10.0, abs=1.0)
+
+
 def test_rates_depend_on_stamps_and_not_on_when_they_are_read(view: View, clock: Clock) -> None:
     for step in range(60):
         # The page is drawn while the viewer is 2 s behind.

@@ -99,6 +99,21 @@ def test_each_tag_has_a_verdict_and_a_track_of_its_own_colour():
     assert {first, second} <= set(page.columns("map", "colour")), "the track of a lost tag keeps its colour"
 
 
+def test_anchor_that_is_bad_for_another_tag_does_not_degrade_this_one():
+    scene, clock = driven()
+    for _ in range(30):
+        clock.now_s += 0.1
+        for tag, wrong in ((7, None), (9, 2)):
+            scene.add_pose(f"tag_{tag}", Pose(4.0, 3.0, 0.0, stamp_s=clock.now_s + 900.0, sd_m=0.1))
+            for anchor in ANCHORS:
+                range_m = 5.0 + 0.9 * (anchor == wrong)
+                scene.add_sample((anchor, tag), Sample(clock.now_s + 900.0, range_m, range_m, 0.1, Status.OK))
+    page = controls(scene)
+    assert page.verdict[:2] == ["good", ""], "of tag 7"
+    assert [row[:2] for row in page.tag_rows] == [["tag 7", "good"], ["tag 9", "degraded"]]
+    assert {row[1]: row[0] for row in page.health}["2 (door)"] == health.BAD
+
+
 def test_position_of_a_lost_tag_is_the_last_one_without_accuracy():
     scene, clock = driven()
     clock.now_s += 12.0
@@ -331,14 +346,14 @@ def test_lost_anchor_and_lost_tag_are_events(silent, expected: list[tuple[float,
             for tag in (7, 8):
                 if not (200 < tenth < 300 and tag == silent[1] and silent[0] in (None, anchor)):
                     incidents.add_range((anchor, tag), tenth / 10, tenth / 10 + 50.0)
-    assert list(incidents.found) == expected
+    assert incidents.latest == expected
 
 
 def test_jump_of_a_position_is_an_event_and_motion_is_not():
     incidents = Incidents()
     for tenth in range(100):
         incidents.add_position("tag 7", tenth / 10, 0.5 * tenth + (3.0 if tenth >= 60 else 0.0), 0.0)
-    assert list(incidents.found) == [(6.0, "position of tag 7: jump by 3.5 m")]
+    assert incidents.latest == [(6.0, "position of tag 7: jump by 3.5 m")]
 
 
 def test_badge_has_the_age_by_reception_and_by_stamp():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import secrets
 import time
 import webbrowser
 from functools import partial
@@ -72,8 +71,7 @@ def view(
         console.err.print(f"{bag} contains raw ranges only: they are corrected for display.", style="yellow")
     thread = player.index(config, settings.stamp_offset_s, displaced_anchor)
     shown = View(player.scene, title=bag.resolve().name, player=player)
-    secret = secrets.token_urlsafe(16) if token else ""
-    with ViewerServer(shown, host, port, tuple(origins or ()), secret) as server:
+    with ViewerServer(shown, host, port, tuple(origins or ()), "generate" if token else "") as server:
         if server.warning:
             console.err.print(f"warning: {server.warning} (--token).", style="yellow")
         console.out.print(f"{server.url} shows {bag}; Ctrl-C ends it.", markup=False, soft_wrap=True)

@@ -6,7 +6,6 @@ It publishes only diagnostics and, with an anchors file, the markers of the anch
 from __future__ import annotations
 
 import re
-import secrets
 from functools import partial
 from pathlib import Path
 
@@ -98,8 +97,8 @@ class Viewer(ManagedNode):
             window=self.value("window"),
         )
         origins = tuple(origin.strip() for origin in self.value("origins").split(",") if origin.strip())
-        token = secrets.token_urlsafe(16) if self.value("token") == "generate" else self.value("token")
-        self._server = ViewerServer(self._view, self.value("host"), self.value("port"), origins, token)
+        host, port, token = (self.value(name) for name in ("host", "port", "token"))
+        self._server = ViewerServer(self._view, host, port, origins, token)
         if self._server.warning:
             self.get_logger().warning(f"{self._server.warning} (parameter token)")
         if self._anchors is not None and self._anchors_out is not None:

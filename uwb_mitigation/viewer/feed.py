@@ -98,7 +98,7 @@ class SceneUpdater:
 
     def corrected(self, key: MeasurementKey, corrected: CorrectedRange) -> None:
         truth = self._truths.pop(key, None)
-        if truth is None:
+        if truth is None and not self.scene.is_whole:
             self._without_truth.add(key, None)
         sd_m = math.sqrt(corrected.variance_m2) if corrected.variance_m2 >= 0.0 else math.nan
         measured = corrected.range_raw_m, corrected.range_m, sd_m, corrected.status

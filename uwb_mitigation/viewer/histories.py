@@ -118,6 +118,9 @@ class RangeColumns(NamedTuple):
     sequence: Column
 
 
+STAMP = RangeColumns._fields.index("stamp_s")
+
+
 class Sample(NamedTuple):
     """One corrected range of a pair; see `RangeColumns`, whose last fields these are."""
 
@@ -170,15 +173,24 @@ class Trace:
 class History(Rows):
     """Ranges of one pair: of the last minute, or of a recording.
 
+    Args:
+        rows: see `RangeColumns`; None: without ranges.
+        outages: see `new_outages`; None: none.
+
     Attributes:
         trace: the last CIR of a stream.
-        is_interrupted: the time until the next range does not count for losses and rate: the viewer itself has dropped ranges.
     """
 
-    def __init__(self, rows: NDArray[np.float64] | None = None) -> None:
+    def __init__(self, rows: NDArray[np.float64] | None = None, outages: Rows | None = None) -> None:
         super().__init__(np.empty((0, len(RangeColumns._fields))) if rows is None else rows)
-        self.is_interrupted = False
+        self._outages = new_outages() if outages is None else outages
         self.trace: Trace | None = None
+
+    @property
+    def is_interrupted(self) -> bool:
+        """Whether the viewer itself has dropped ranges since the last one: the time until the next one is no interval."""
+        outages = self._outages.rows
+        return len(outages) > 0 and bool(outages[-1, 1] > self.latest_stamp_s)
 
     @property
     def columns(self) -> RangeColumns:
@@ -193,11 +205,14 @@ class History(Rows):
         sample = Sample(*self._data[self._end - 1, -len(Sample._fields) :].tolist())
         return sample._replace(status=Status(int(sample.status)))
 
+    @property
+    def latest_stamp_s(self) -> float:
+        """Stamp of the last range; NaN: there is none."""
+        return float(self._data[self._end - 1, STAMP]) if self._end > self._begin else math.nan
+
     def add(self, sample: Sample, received_s: float, residual_m: float, limit: int | None) -> None:
         """Add a range; see `RangeColumns` and `append`."""
-        latest = None if self.is_interrupted else self.latest
-        interval_s = math.nan if latest is None else sample.stamp_s - latest.stamp_s
-        self.is_interrupted = False
+        interval_s = math.nan if self.is_interrupted else sample.stamp_s - self.latest_stamp_s
         self.append((received_s, residual_m, interval_s, *sample), limit)
 
     def remove_before(self, stamp_s: float) -> None:
@@ -220,11 +235,24 @@ class History(Rows):
         }
 
     def _lost_percent(self) -> float:
-        """Return the share of missing sequence numbers. Anchors are polled in turn: the usual step is the median of all."""
-        steps = np.diff(self.columns.sequence) % 2**32
-        steps = steps[(steps > 0) & (steps < 1000) & np.isfinite(self.columns.interval_s[1:])]
-        lost = float((np.rint(steps / np.median(steps)) - 1.0).clip(0.0).sum()) if len(steps) else 0.0
-        return 100.0 * lost / max(lost + len(self.columns.sequence), 1.0)
+        """Return the share of missing sequence numbers while the viewer has dropped no ranges; NaN: unknown.
+
+        Anchors are polled in turn: the usual step is the median of all. Also without the ranges half an interval before and
+        after an outage: it begins and ends with a range that was not lost.
+        """
+        stamp_s, interval_s = self.columns.stamp_s, self.columns.interval_s[1:]
+        steps, is_interval = np.diff(self.columns.sequence) % 2**32, np.isfinite(interval_s)
+        is_step = (steps > 0) & (steps < 1000)
+        if not (is_step & is_interval).any():
+            return math.nan
+        polls = np.where(is_step, np.rint(steps / np.median(steps[is_step & is_interval])), 1.0).clip(1.0)
+        number, margin_s = np.append(0.0, np.cumsum(polls)), 0.5 * np.median(interval_s[is_interval])
+        outages_s = self._outages.rows.T + np.array([[-margin_s], [margin_s]])
+        outages_s[1, :-1] = np.minimum(outages_s[1, :-1], outages_s[0, 1:])
+        numbers = np.ceil(np.interp(outages_s, stamp_s, number, right=number[-1] + 1.0))
+        polled = number[-1] + 1.0 - np.diff(numbers, axis=0).sum()
+        received = len(stamp_s) - np.diff(np.searchsorted(stamp_s, outages_s), axis=0).sum()
+        return 100.0 * float(np.clip(1.0 - received / polled, 0.0, 1.0)) if polled > 0.0 else math.nan
 
     def rate_hz(self, age_s: float = 0.0) -> float:
         """Return the rate of the last `RATE_RANGES` ranges by their stamps; NaN before the second one.
@@ -261,6 +289,11 @@ class History(Rows):
         )
         interval_s, nlos = latest.mean().to_numpy().T
         return np.column_stack([columns.received_s, residual_m, 1.0 / interval_s, 100.0 * nlos])
+
+
+def new_outages() -> Rows:
+    """Return the intervals, by stamps of a tag, in which the viewer has dropped ranges: begin and end, s."""
+    return Rows(np.empty((0, 2)))
 
 
 def _plausible_values(values: Column) -> Column:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections import deque
+from bisect import insort
 from dataclasses import dataclass
 
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.viewer.histories import NO_DATA_INTERVALS, NO_DATA_S, BoundedDict, Pair
 
-MAX_EVENTS, MAX_SOURCES = 100, 1000
+MAX_EVENTS, MAX_SOURCES = 500, 1000
 CHECK_S = 0.5
 """Interval of the search for sources that have stopped."""
 CLOCK_JUMP_S = 10.0
@@ -34,18 +34,22 @@ class _Source:
 class Incidents:
     """Finds incidents in ranges and positions, which are added in the order of their times on one clock.
 
-    Args:
-        limit: number of the latest incidents that are kept; None: all, of a recording.
-
     Attributes:
-        found: (time, s; text) of the incidents.
+        count: number of incidents.
+        latest: time (s) and text of the latest `MAX_EVENTS`, in the order of time.
     """
 
-    def __init__(self, limit: int | None = MAX_EVENTS) -> None:
-        self.found: deque[tuple[float, str]] = deque(maxlen=limit)
+    def __init__(self) -> None:
+        self.count, self.latest = 0, list[tuple[float, str]]()
         # A tag comes before its anchors.
         self._sources: BoundedDict[tuple[int | None, int | str], _Source] = BoundedDict(MAX_SOURCES)
         self._check_s = -math.inf
+
+    def add(self, time_s: float, text: str) -> None:
+        """Add an incident."""
+        self.count += 1
+        insort(self.latest, (time_s, text))
+        del self.latest[:-MAX_EVENTS]
 
     def add_range(self, pair: Pair, time_s: float, stamp_s: float) -> None:
         """Add a range at a time; `stamp_s` is on the clock of its tag."""
@@ -53,7 +57,7 @@ class Incidents:
         jump_s, source.stamp_s = stamp_s - source.stamp_s - passed_s, stamp_s
         # Ranges that are read late arrive at once.
         if abs(jump_s) > CLOCK_JUMP_S:
-            self.found.append((time_s, f"clock of tag {format_id(pair[1])}: jump by {jump_s:+.0f} s"))
+            self.add(time_s, f"clock of tag {format_id(pair[1])}: jump by {jump_s:+.0f} s")
         self._add(pair, time_s)
 
     def add_position(self, label: str, time_s: float, x: float, y: float) -> None:
@@ -61,7 +65,7 @@ class Incidents:
         source, passed_s = self._add((None, label), time_s)
         moved_m, source.place = math.dist(source.place, (x, y)), (x, y)
         if moved_m > JUMP_M + MAX_SPEED * passed_s:
-            self.found.append((time_s, f"position of {label}: jump by {moved_m:.1f} m"))
+            self.add(time_s, f"position of {label}: jump by {moved_m:.1f} m")
 
     def _add(self, key: tuple[int | None, int | str], time_s: float) -> tuple[_Source, float]:
         """Return a source and the time since its last data."""
@@ -73,7 +77,7 @@ class Incidents:
         passed_s, source.time_s = time_s - source.time_s, time_s
         if source.is_lost:
             source.is_lost = False
-            self.found.append((time_s, f"{_name(key)}: back after {passed_s:.0f} s"))
+            self.add(time_s, f"{_name(key)}: back after {passed_s:.0f} s")
             if key[0] is None:
                 # The tag was away, not its anchors.
                 for (_, tag), source_of_tag in self._sources.items():
@@ -91,7 +95,7 @@ class Incidents:
             is_late = now_s - source.time_s > max(NO_DATA_S, NO_DATA_INTERVALS * source.interval_s)
             if is_late and not tag.is_lost and not source.is_lost:
                 source.is_lost = True
-                self.found.append((source.time_s, f"{_name(key)}: lost"))
+                self.add(source.time_s, f"{_name(key)}: lost")
 
 
 def _name(key: tuple[int | None, int | str]) -> str:

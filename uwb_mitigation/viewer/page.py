@@ -111,8 +111,7 @@ class Page:
         if is_changed or now_s > self._sent_s + HEARTBEAT_S:
             self._sent, self._sent_s, self._redraw = self._sent + 1, now_s, False
             age_s = scene.clock() - scene.received_s if self._state.has_data else -1.0
-            tag_id = self._state.tag_id
-            stamp_s = math.nan if tag_id is None else scene.latest_stamp_s(tag_id)
+            stamp_s = scene.latest_stamp_s(self._state.tag_id)
             stamp_age_s = scene.stamp_clock() - stamp_s if math.isfinite(stamp_s) else age_s
             numbers = round(self._took_s, 3), round(age_s, 3), round(stamp_age_s, 3)
             self._controls.update = [self._sent, *numbers]
@@ -147,7 +146,7 @@ class Page:
         timeline, seconds = self._view.timeline, max(player.seconds, 1e-9)
         if timeline is not None and self._state.changed("marks", timeline.is_complete):
             bad = np.unique((timeline.bad_s / seconds).round(3)).tolist()
-            incidents = [time_s / seconds for time_s, _ in sorted(timeline.scene.incidents.found)]
+            incidents = [time_s / seconds for time_s, _ in timeline.scene.incidents.latest]
             self._state.set(marks={"bad": bad, "count": timeline.scene.faults, "incidents": incidents})
 
     # Events ---------------------------------------------------------------------------------------------------

@@ -331,11 +331,13 @@ def estimate_tracks(
 
 def _add_incidents(scene: Scene, label: str, track: NDArray[np.float64], seconds: float) -> None:
     """Add the incidents of an estimated track until the end of the recording."""
-    incidents = Incidents(None)
+    incidents = Incidents()
     for time_s, x, y in track[:, :3].tolist():
         incidents.add_position(label, time_s, x, y)
     incidents.check(seconds)
-    scene.incidents.found.extend(incidents.found)
+    for incident in incidents.latest:
+        scene.incidents.add(*incident)
+    scene.incidents.count += incidents.count - len(incidents.latest)
 
 
 def add_residuals(scene: Scene, anchors: AnchorMap) -> None:
@@ -366,4 +368,4 @@ def _add_largest_error(scene: Scene) -> None:
     largest_m, time_s, (anchor_id, tag_id) = largest
     if largest_m > 0.0:
         text = f"largest {name} of a range, {largest_m:.2f} m: anchor {format_id(anchor_id)}, tag {format_id(tag_id)}"
-        scene.incidents.found.append((-time_s, text))
+        scene.incidents.add(-time_s, text)

@@ -35,6 +35,7 @@ from uwb_mitigation.viewer.histories import (
     Rows,
     Sample,
     Trace,
+    new_outages,
 )
 from uwb_mitigation.viewer.incidents import Incidents
 from uwb_mitigation.viewer.palette import TrackKind
@@ -42,6 +43,7 @@ from uwb_mitigation.viewer.palette import TrackKind
 # Limits. Ids and texts come from the air or the network; above a limit, the oldest entries are removed.
 MAX_PAIRS, MAX_TAGS, MAX_NODES = 256, 64, 64
 MAX_TRACK = 3000  # points
+MAX_OUTAGES = 1000  # of the reading of ranges
 MAX_TEXT = 400  # characters of a name or a message
 MAX_COORDINATE_M = 2e7  # any position on Earth; a position further away is ignored
 
@@ -56,6 +58,7 @@ STEP_M, STEP_S = 0.02, 0.09
 HEIGHT_VARIANCE_M2 = 0.01
 """Of the published height, for the positions from raw ranges."""
 
+_NEVER = math.nan, math.nan
 DEFAULT_TAG = "tag"
 """Name of the tag whose topics have the plain names; the others are named as `tag_frame` does."""
 
@@ -151,9 +154,10 @@ class Scene:
 
     def clear(self) -> None:
         """Remove everything except the anchors."""
-        self.incidents = Incidents(None) if self.is_whole else Incidents()
+        self.incidents = Incidents()
         # Stamps of different tags may come from different clocks.
-        self.latest_stamps: BoundedDict[int, tuple[float, float]] = BoundedDict(MAX_TAGS)
+        self.latest_stamps: BoundedDict[int | None, tuple[float, float]] = BoundedDict(MAX_TAGS)
+        self._outages: BoundedDict[int | None, Rows] = BoundedDict(MAX_TAGS)
         self.ranges = self.corrected = self.faults = self.dropped = 0
         self.pairs: BoundedDict[Pair, History] = BoundedDict(math.inf if self.is_whole else MAX_PAIRS)
         self.tags: BoundedDict[str, Pose] = BoundedDict(MAX_TAGS)
@@ -171,27 +175,21 @@ class Scene:
         """The name of the tracks of `TrackKind.CORRECTED` in legends."""
         return "not corrected" if self.ranges and not self.corrected else TrackKind.CORRECTED.value
 
-    def now_s(self, tag_id: int | None = None) -> float:
-        """Return the latest stamp of a tag (None: of the latest range) plus the time since then; NaN before any."""
-        entry = (
-            next(reversed(self.latest_stamps.values()), None)
-            if tag_id is None
-            else self.latest_stamps.get(tag_id)
-        )
-        latest_s, received_s = entry or (math.nan, math.nan)
+    def now_s(self, tag_id: int | None) -> float:
+        """Return the latest stamp of a tag plus the time since then; NaN before any."""
+        latest_s, received_s = self.latest_stamps.get(tag_id, _NEVER)
         return latest_s + max(self.clock() - received_s, 0.0)
 
-    def latest_stamp_s(self, tag_id: int) -> float:
+    def latest_stamp_s(self, tag_id: int | None) -> float:
         """Return the latest stamp of a tag; NaN: none."""
-        return self.latest_stamps.get(tag_id, (math.nan, math.nan))[0]
+        return self.latest_stamps.get(tag_id, _NEVER)[0]
 
     def stamp_age_s(self, pair: Pair) -> float:
         """Return the time from the last range of a pair to that of its tag by their stamps: 0 without other ranges.
 
         It does not depend on how fast the viewer reads them.
         """
-        latest, (tag_latest_s, _) = self.pairs[pair].latest, self.latest_stamps.get(pair[1], (-math.inf, 0.0))
-        return 0.0 if latest is None else max(tag_latest_s - latest.stamp_s, 0.0)
+        return max(0.0, self.latest_stamp_s(pair[1]) - self.pairs[pair].latest_stamp_s)
 
     def age_s(self, entry: Rows | Pose) -> float:
         """Return the time since the last data of a pair, tag or track."""
@@ -205,7 +203,10 @@ class Scene:
     def history(self, pair: Pair) -> History:
         """Return the history of a pair, a new one for a new pair."""
         self.revision += 1
-        return self.pairs.add(pair, self.pairs.get(pair) or History())
+        return self.pairs.add(pair, self.pairs.get(pair) or History(outages=self._outages_of(pair[1])))
+
+    def _outages_of(self, tag_id: int | None) -> Rows:
+        return self._outages.add(tag_id, self._outages.get(tag_id) or new_outages())
 
     def add_sample(self, pair: Pair, sample: Sample) -> None:
         """Add a corrected range.
@@ -213,12 +214,9 @@ class Scene:
         If the time of a pair jumps back by more than a second (a replay in a loop), the strips of its tag start again.
         """
         tag_id, stamp_s = pair[1], sample.stamp_s
-        latest, (tag_latest_s, _) = (
-            self.history(pair).latest,
-            self.latest_stamps.get(tag_id, (-math.inf, 0.0)),
-        )
-        if stamp_s < tag_latest_s - HISTORY_S or (latest and stamp_s < latest.stamp_s - 1.0):
-            tag_latest_s = -math.inf
+        tag_latest_s, history = self.latest_stamp_s(tag_id), self.history(pair)
+        if stamp_s < tag_latest_s - HISTORY_S or stamp_s < history.latest_stamp_s - 1.0:
+            tag_latest_s = math.nan
             if not self.is_whole:
                 self.clear_history(tag_id)
         if not stamp_s < tag_latest_s:
@@ -232,6 +230,8 @@ class Scene:
         if self.is_whole:
             history.add(sample, self.received_s, math.nan, None)
         else:
+            end_s = self._outages_of(tag_id).rows[-1:, 1]
+            end_s[:] = np.minimum(end_s, tag_latest_s)
             history.add(sample, self.received_s, self._compare_with_position(pair, sample), MAX_SAMPLES)
             history.remove_before(tag_latest_s - HISTORY_S)
         if not math.isnan(sample.true_m):
@@ -240,7 +240,8 @@ class Scene:
     def count_errors(self, errors_m: NDArray[np.float64]) -> None:
         """Count raw and corrected errors, float64 (2, n), in the histograms; NaN: the truth is unknown."""
         errors_m = errors_m[:, (np.abs(errors_m) <= MAX_RANGE_M).all(axis=0)]
-        self.error_counts += count_errors(errors_m)
+        inside_m = errors_m.clip(ERROR_EDGES_M[0], ERROR_EDGES_M[-1])
+        self.error_counts += [np.histogram(row, ERROR_EDGES_M)[0] for row in inside_m]
         self.error_sums_m += np.abs(errors_m).sum(axis=1)
         self.errors += errors_m.shape[1]
 
@@ -375,13 +376,17 @@ class Scene:
     def count_dropped(self, number: int) -> None:
         """Count ranges that the viewer itself has dropped; they do not count as lost."""
         self.dropped += number
-        for history in self.pairs.values():
-            history.is_interrupted = True
+        for tag_id, (stamp_s, _) in self.latest_stamps.items():
+            outages = self._outages_of(tag_id)
+            if not np.isinf(outages.rows[-1:, 1]).any():
+                outages.append((stamp_s, math.inf), MAX_OUTAGES)
 
     def clear_history(self, tag_id: int) -> None:
         """Remove the last minute of the pairs of a tag, but not the counts."""
         self.latest_stamps.pop(tag_id, None)
-        self.pairs.update({pair: History() for pair in self.pairs if pair[1] == tag_id})
+        self._outages.pop(tag_id, None)
+        outages = self._outages_of(tag_id)
+        self.pairs.update({pair: History(outages=outages) for pair in self.pairs if pair[1] == tag_id})
 
     def latest(self) -> Iterator[tuple[Pair, History, Sample]]:
         """Yield every pair with its last range, by anchor and tag; also pairs that have stopped."""
@@ -412,13 +417,6 @@ def tag_label(name: str, plain_id: int | None) -> str:
     if name == DEFAULT_TAG and plain_id is not None:
         return f"tag {format_id(plain_id)}"
     return name.replace("_", " ")
-
-
-def count_errors(errors_m: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the numbers of raw and corrected errors float64 (2, n) in each bin, int64 (2, bins)."""
-    bins = len(ERROR_EDGES_M) - 1
-    rows = np.clip(np.searchsorted(ERROR_EDGES_M, errors_m, side="right") - 1, 0, bins - 1)
-    return np.stack([np.bincount(row, minlength=bins) for row in rows])
 
 
 def finite_or_zero(value: float) -> float:

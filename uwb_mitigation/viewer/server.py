@@ -47,7 +47,8 @@ class ViewerServer(AbstractContextManager["ViewerServer"]):
         view: the view that the pages show.
         host, port: address to bind; port 0 selects a free port, and the attribute `port` has its number.
         origins: further `host:port` that are accepted in the headers Host and Origin, for a proxy or a host name.
-        token: the URL must contain `?token=` and this text; the page then stores it as a cookie. Empty: no protection.
+        token: the URL must contain `?token=` and this text; the page then stores it as a cookie. Empty: no protection;
+            `generate`: a random one.
 
     Attributes:
         url: URL of the page. warning: why other computers could use it; empty: they cannot.
@@ -71,6 +72,7 @@ class ViewerServer(AbstractContextManager["ViewerServer"]):
                 f"the page cannot be served at {host}:{port}: {error}",
                 valid="a free port, and a name or an address of this machine",
             ) from error
+        token = secrets.token_urlsafe(16) if token == "generate" else token
         application = _Application(view, accepted_hosts(host, self.port, origins), token)
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(

@@ -144,8 +144,8 @@ class Texts:
 
     def _facts(self, scene: Scene, accuracy: str) -> str:
         """Return accuracy and age, and a line for each other interval: what the correction changes, share of corrected ranges."""
-        tag_id, texts = self._page.tag_id, [accuracy] if accuracy else []
-        if tag_id is not None and math.isfinite(stamp_s := scene.latest_stamp_s(tag_id)):
+        texts = [accuracy] if accuracy else []
+        if math.isfinite(stamp_s := scene.latest_stamp_s(self._page.tag_id)):
             texts.append(f"last range {scene.stamp_clock() - stamp_s:.1f} s old by stamp")
         if scene.dropped:
             texts.append(f"{scene.dropped} ranges dropped by the viewer")
@@ -175,11 +175,14 @@ class Texts:
 
     def _incidents(self, scene: Scene) -> list[tuple[float | None, str]]:
         """Return the incidents: time in the recording, None if they are live; text."""
-        if self._view.player is not None:
-            return [] if self._view.timeline is None else sorted(self._view.all_data.incidents.found)
-        scene.incidents.check(now_s := scene.clock())
-        latest = list(scene.incidents.found)[-MAX_SHOWN_EVENTS:]
-        return [(None, f"{now_s - time_s:.0f} s ago: {text}") for time_s, text in latest]
+        incidents, now_s = self._view.all_data.incidents, scene.clock()
+        shown: list[tuple[float | None, str]] = list(incidents.latest)
+        if self._view.player is None:
+            incidents.check(now_s)
+            ages = incidents.latest[-MAX_SHOWN_EVENTS:]
+            shown = [(None, f"{now_s - time_s:.0f} s ago: {text}") for time_s, text in ages]
+        hidden = incidents.count - len(shown)
+        return [(None, f"{hidden} earlier events are not shown"), *shown] if hidden else shown
 
 
 def _tag_rows(scene: Scene, pairs: dict[Pair, Means], verdicts: dict[int | None, Verdict]) -> list[list[str]]:

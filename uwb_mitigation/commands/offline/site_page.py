@@ -15,7 +15,7 @@ from uwb_mitigation.errors import format_id
 from uwb_mitigation.mitigation.model.bundle import Bundle
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.report import draw_boxes, draw_scene, render_report
-from uwb_mitigation.viewer.scene import POSITION, Pose, Scene, count_errors
+from uwb_mitigation.viewer.scene import POSITION, Pose, Scene
 from uwb_mitigation.viewer.state import View
 
 PERCENTILES = (5, 25, 50, 75, 95)
@@ -108,6 +108,5 @@ def _view(calibration: SiteCalibration, errors_m: np.ndarray[Any, Any]) -> View:
         if len(places) == 1:
             # A stationary tag.
             scene.add_pose(f"segment {segment}", Pose(*places[0].tolist()))
-    scene.error_counts += count_errors(errors_m)
-    scene.errors = errors_m.shape[1]
+    scene.count_errors(errors_m)
     return View(scene)
