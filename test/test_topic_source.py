@@ -204,6 +204,9 @@ def test_standard_messages():
     convert = Convert("string_at")
     assert convert.take(String(data=line)) == [(4, 0, 0.72), (4, 2, 1.31)]
     assert [measured.cir.rx_power_dbm for measured in convert.published] == [-77.6, -75.13]
+    # Newer firmware names the anchors.
+    line = "AT+RANGE=tid:4,mask:03,seq:219,range:(90,210,0,0,0,0,0,0),ancid:(7,5,-1,-1,-1,-1,-1,-1)"
+    assert convert.take(String(data=line))[-2:] == [(4, 7, 0.9), (4, 5, 2.1)]
     message = String(data='{"tag": 1, "ranges": [{"anchor": 2, "range_m": 3}]}')
     assert Convert("string_json").take(message) == [(1, 2, 3.0)]
 

@@ -142,19 +142,20 @@ def track_tag(recording: TagRecording, config: EstimatorConfig) -> TagTracks:
             f"odometry contradicted the ranges {times} times and was not used then: wheels that slip, a robot moved by hand, "
             "wrong axes, scale or signs"
         )
-    warnings += _smoothing_warnings(errors["live"], errors["smoothed"])
+    warnings += _smoothing_warnings(errors["live"], errors["smoothed"], is_unique=determined.is_unique)
     return TagTracks(
         recording, **tracks, errors=errors, hdop=hdop, determination=determined, warnings=warnings
     )
 
 
-def _smoothing_warnings(live: TrackErrors, smoothed: TrackErrors) -> list[str]:
+def _smoothing_warnings(live: TrackErrors, smoothed: TrackErrors, *, is_unique: bool) -> list[str]:
     warnings = []
     if smoothed.rmse > WORSE * live.rmse:
         warnings.append(
             f"smoothing increases the RMSE from {live.rmse:.3f} m to {smoothed.rmse:.3f} m. Use the live track"
         )
-    if smoothed.height_rmse > WORSE * max(live.height_rmse, MIN_HEIGHT_RMSE_M):
+    # Of two mirrored heights, each track has either.
+    if is_unique and smoothed.height_rmse > WORSE * max(live.height_rmse, MIN_HEIGHT_RMSE_M):
         warnings.append(
             f"smoothing increases the RMSE of the height from {live.height_rmse:.3f} m to {smoothed.height_rmse:.3f} m. Use "
             "the live track"

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.recordings.mapping.mapping import SCALES, TIME, FieldRule, RowFilter
+from uwb_mitigation.recordings.mapping.mapping import LIST_INDEX, SCALES, TIME, FieldRule, RowFilter
 from uwb_mitigation.types.measurement import (
     LINEAR_MAGNITUDES,
     Cir,
@@ -169,7 +169,8 @@ class Converter:
         """Return the columns of the table that are needed, and whether they may be missing."""
         columns: dict[str, bool] = {}
         for value in filter(None, self.values.values()):
-            columns |= {name: value.optional and columns.get(name, True) for name in value.columns}
+            may_be_missing = value.optional or value.or_index
+            columns |= {name: may_be_missing and columns.get(name, True) for name in value.columns}
         return columns
 
     @property
@@ -299,6 +300,11 @@ def _raw(value: FieldRule, chunk: Chunk) -> NDArray[Any] | None:
     for name, array in zip(names, arrays, strict=True):
         if array.ndim > 1 or (array.dtype == object and len(array) and np.ndim(array[0])):
             raise RecordingError(f"column {name} contains lists", where=str(chunk.path), valid=f"{name}[]")
+    if value.or_index:
+        index = chunk.columns[LIST_INDEX]
+        return np.array(
+            [number if cell is None else cell for cell, number in zip(arrays[0], index, strict=True)]
+        )
     if not value.sum:
         return arrays[0]
     factors = zip(value.sum.items(), arrays, strict=True)

@@ -120,6 +120,7 @@ class FieldRule(_Strict):
         units: {anchor: unit} of lengths whose unit differs from `unit`.
         scale, offset: value * scale + offset, after the unit; of stamps the offset is in s.
         optional: if the column is absent or the pattern does not match, the value is unknown.
+        or_index: if a message does not contain the column, the value is the index in the list.
     """
 
     column: str = ""
@@ -137,6 +138,7 @@ class FieldRule(_Strict):
     scale: float = Field(default=1.0, allow_inf_nan=False)
     offset: float = Field(default=0.0, allow_inf_nan=False)
     optional: bool = False
+    or_index: bool = False
 
     @model_validator(mode="after")
     def _check(self) -> FieldRule:
