@@ -203,9 +203,12 @@ def test_the_output_of_a_dwm1001_is_on_in_whatever_state_it_was(state: str, opti
     assert len(run(80.0)) > 20
 
 
-def test_a_board_without_ranges_is_explained(tmp_path: Path):
+def test_a_board_without_ranges_is_explained(ros: ros_harness.Ros, tmp_path: Path):
     terminal = PseudoTerminal(tmp_path / "b0")
     terminal.plug()
+    driver = ros.start("driver", "source:=lines", "map:=string_at", f"port:={tmp_path}/b0")
+    driver.wait_for_output("no range in 5 s: no range yet: nothing was received; is the baud rate 115200")
+    assert driver.signal(signal.SIGINT) == 0
     with open_board(tmp_path / "b0", "at") as events:
         wait_until(lambda: events.port.device)
         assert "no range yet: nothing was received; is the baud rate 115200" in events.port.report().warning

@@ -112,6 +112,13 @@ def test_variance_of_a_range_without_cir_does_not_depend_on_the_offset(tmp_path,
         assert result.variance_m2 == max(uncorrected_m2, UNRELIABLE_VARIANCE_M2)
 
 
+def test_range_below_the_offset_says_so(mitigation):
+    result = Mitigation(mitigation.bundle, 5.0).correct([measurement(3.0)])[0]
+    assert (result.range_m, result.variance_m2) == (-2.0, math.inf)
+    assert result.status is Status.OUT_OF_DISTRIBUTION
+    assert result.reason == "range of 3.00 m, below the offset of 5.00 m"
+
+
 @pytest.mark.parametrize(("changes", "range_m", "status", "reason"), BAD)
 def test_invalid_measurement_passes_through_with_its_reason(mitigation, changes, range_m, status, reason):
     result = mitigation.correct([measurement(range_m, **changes)])[0]

@@ -51,6 +51,17 @@ def test_ranges_before_the_other_topic_are_not_lost(late: str):
     assert "37 of the " in console.export_text()
 
 
+def test_ranges_without_a_mitigator_are_not_called_lost():
+    statistics = RangeStatistics()
+    statistics.add_raw(0)
+    console = Console(width=100, record=True)
+    console.print(summary(statistics))
+    assert (
+        "1 ranges received, 0 corrected, no /uwb/range_corrected: is the mitigator running?"
+        in console.export_text()
+    )
+
+
 def test_errors_are_absolute_and_grouped_by_label():
     statistics = RangeStatistics()
     for sequence, true_m, label, raw, out in (

@@ -167,6 +167,15 @@ def test_variance_of_ranges_without_cir_is_that_of_real_errors(tmp_path: Path):
         assert 0.05 < np.nanmean(error_m**2 / variance_m2) < 4.0, recorded.name
 
 
+def test_stamps_in_another_unit_are_reported():
+    ranges, _ = drive(seconds=8)
+    locator = TagLocator(HALL, height_m=1.0)
+    for row in range(len(ranges)):
+        anchor, range_m = HALL.anchors[ranges.anchor[row]].id, float(ranges.range_m[row])
+        locator.add(RangeMeasurement(row, 7, anchor, row, 0, range_m, Cir(np.zeros(0, np.int16))))
+    assert "stamps must be nanoseconds" in locator.warnings()[0]
+
+
 def test_radio_without_cirs_is_located_live_as_from_raw_ranges():
     ranges, _ = drive(seconds=8)
     raw, passed, mixed = (TagLocator(HALL, height_m=1.0) for _ in range(3))

@@ -217,7 +217,7 @@ class Corrector:
                     _STATUSES[status],
                     corrected.origin,
                     model_id,
-                    reason(status, fault, range_raw_m) if status else "",
+                    reason(status, fault, range_raw_m, correction_m) if status else "",
                 )
         return [result for result in results if result is not None]
 

@@ -196,10 +196,12 @@ def summary(statistics: RangeStatistics) -> Group:
         f"{statistics.statuses[status]} {status.name}" for status in Status if statistics.statuses[status]
     )
     corrected = f"{statistics.corrected} corrected" + (f" ({statuses})" if statuses else "")
-    lines: list[Text | Table] = [
-        Text(),
-        Text(f"{statistics.raw} ranges received, {corrected}, {statistics.missing} lost"),
-    ]
+    lost = (
+        f"{statistics.missing} lost"
+        if statistics.corrected
+        else f"no {topics.RANGE_CORRECTED}: is the mitigator running?"
+    )
+    lines: list[Text | Table] = [Text(), Text(f"{statistics.raw} ranges received, {corrected}, {lost}")]
     for topic, reference in (("corrected", "raw"), ("raw", "corrected")):
         if early := statistics.early[topic]:
             lines.append(Text(f"{early} of the {topic} ranges came before the first {reference} range"))

@@ -23,6 +23,9 @@ from uwb_mitigation.types.tracks import Estimate, Heights, Ranges, Track
 MAX_TAGS = 256
 """More tags are probably damaged numbers."""
 
+MIN_RANGES, MAX_RATE_HZ = 100, 10_000.0
+"""No radio ranges faster; stamps of more ranges at a higher rate are in another unit than nanoseconds."""
+
 UNKNOWN_HEIGHT_SD_M = 0.1
 """Standard deviation of a measured height without a variance."""
 
@@ -132,7 +135,8 @@ class TagState:
         tag_id: its number.
         estimator: position from ranges only. robot: with odometry, if a robot carries this tag; it contains `estimator`.
         smoother: of this tag.
-        latest_ns: stamp of its latest range.
+        latest_ns: stamp of its latest range. ranges: number of its ranges.
+        first_ns: stamp of its first range.
         is_corrected: whether a range of this tag was corrected.
     """
 
@@ -141,6 +145,8 @@ class TagState:
     smoother: FixedLagSmoother
     robot: RobotEstimator | None = None
     latest_ns: int = 0
+    ranges: int = 0
+    first_ns: int = 0
     is_corrected: bool = False
 
     @property
@@ -217,6 +223,8 @@ class MultiTagEstimator:
             return None
         if tag is None:
             tag = self.tags[tag_id] = self._new_tag(tag_id)
+            tag.first_ns = stamp_ns
+        tag.ranges += 1
         tag.is_corrected |= is_corrected
         estimate = tag.best.add(measurement)
         tag.latest_ns = stamp_ns
@@ -242,6 +250,11 @@ class MultiTagEstimator:
             warnings.append(f"ranges of anchors that are not in the anchors file: {names}")
         for tag in self.tags.values():
             estimator, name = tag.estimator, f"tag {format_id(tag.tag_id)}"
+            span_s = (tag.latest_ns - tag.first_ns) / NS_PER_S
+            if tag.ranges >= MIN_RANGES and tag.ranges > MAX_RATE_HZ * abs(span_s):
+                warnings.append(
+                    f"{name}: {tag.ranges} ranges in {span_s:.6f} s: positions are wrong, because stamps must be nanoseconds"
+                )
             determination = current_determination(estimator)
             if not determination.is_unique:
                 warnings.append(f"{name}: {determination}")

@@ -135,13 +135,14 @@ MAX_REACH_M = 1000.0
 """A radio reaches a few hundred metres: larger numbers are probably millimetres."""
 
 
-def reason(status: int, fault: int, range_m: float) -> str:
+def reason(status: int, fault: int, range_m: float, offset_m: float = 0.0) -> str:
     """Return why a measured range was not corrected; empty: it was.
 
     Args:
         status: its `Status`.
         fault: its `CirFault`; 0: none.
         range_m: the measured range.
+        offset_m: the offset that was subtracted.
     """
     if status in (Status.OK, Status.UNRELIABLE):
         return ""
@@ -149,6 +150,8 @@ def reason(status: int, fault: int, range_m: float) -> str:
         return f"range of {range_m:,.2f} m, beyond {MAX_REACH_M:,.0f} m: divide millimetres by 1000"
     if not range_m >= 0.0:
         return f"range of {range_m:.2f} m; valid: 0 or more"
+    if range_m < offset_m:
+        return f"range of {range_m:.2f} m, below the offset of {offset_m:.2f} m"
     return _FAULT_TEXTS[CirFault(fault)] if fault else _STATUS_TEXTS[Status(status)]
 
 
@@ -457,7 +460,7 @@ class CorrectedColumns:
     @property
     def reason(self) -> NDArray[np.str_]:
         """Why each range was not corrected, text (n,); empty: it was."""
-        columns = (self.status, self.fault, self.range_m + self.correction_m)
+        columns = (self.status, self.fault, self.range_m + self.correction_m, self.correction_m)
         return np.array([reason(*row) for row in zip(*(c.tolist() for c in columns), strict=True)], np.str_)
 
     @classmethod

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import importlib
 import logging
+import math
 import threading
+import time
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any, Protocol
@@ -23,6 +25,9 @@ RADIO_SOURCES = ("serial", "evb1000", "spi", "uci", "lines", "pans")
 
 CAPTURED_SOURCES = ("uci", "lines", "pans")
 """Sources that replay a capture, if there is a path."""
+
+NO_RANGE_S = 5.0
+"""After this time without a range, the reason is also in the log: who starts a driver for the first time looks there."""
 
 
 class SourceHandle(Protocol):
@@ -88,10 +93,12 @@ class RadioFeed:
         self._publishing = threading.Lock()
         self._settings = source.read_settings(value)
         self._ports: Sequence[RadioPort] = ()
+        self._silent_until_s = math.inf
 
     def start(self) -> None:
         """Open the radios."""
         self._ports = self._source.open(self._settings, self._on_event, self._now_ns)
+        self._silent_until_s = time.monotonic() + NO_RANGE_S
 
     def stop(self) -> None:
         """Close the radios, all at the same time."""
@@ -116,6 +123,11 @@ class RadioFeed:
         problem = "; ".join(report.problem for report in reports if report.problem)
         warning = next((report.warning for report in reports if report.warning), "")
         level = diagnostics.ERROR if problem else diagnostics.WARN if warning else diagnostics.OK
+        if time.monotonic() > self._silent_until_s:
+            self._silent_until_s = math.inf
+            # The ports have logged problems.
+            if warning and not problem and not self._ranges:
+                self._logger.warning(f"no range in {NO_RANGE_S:.0f} s: {warning}")
         hardware, activity = (reports[0].hardware, reports[0].activity) if reports else ("no radio", "closed")
         return hardware, level, problem or warning or activity, values
 
