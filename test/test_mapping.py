@@ -154,8 +154,23 @@ def test_cirs_in_text_keep_their_values(form: str, text: str, samples: list[int]
     assert next(iter(source)).measurement.cir.encoding == expected
 
 
-def test_real_values_of_complex_cirs_are_numbers_and_not_pairs():
-    assert read_cir([3.0, 4.0, 5.0], "complex").samples.tolist() == [3, 0, 4, 0, 5, 0]
+def test_real_and_imaginary_parts_in_two_columns_are_complex_samples(tmp_path: Path):
+    cir = {"column": "i", "imaginary": "q"}
+    assert cirs_of(of('t,a,r,i,q\n0,1,2,"3 4","-1 2"\n', tmp_path / "x.csv", cir=cir)) == [[3, -1, 4, 2]]
+    series = {"column": "i{0..1}", "imaginary": "q{0..1}"}
+    source = of("t,a,r,i0,i1,q0,q1\n0,1,2,3,4,-1,2\n", tmp_path / "y.csv", cir=series)
+    assert cirs_of(source) == [[3, -1, 4, 2]]
+    with pytest.raises(RecordingError, match="row 1: 2 real and 3 imaginary parts"):
+        of('t,a,r,i,q\n0,1,2,"3 4","-1 2 5"\n', tmp_path / "z.csv", cir=cir)
+    with pytest.raises(ValueError, match="imaginary without samples"):
+        of("t,a,r,i,q\n", tmp_path / "z.csv", cir=cir | {"samples": "complex"})
+
+
+def test_real_parts_alone_are_no_complex_samples():
+    with pytest.raises(RecordingError, match=r"real numbers instead of complex ones.*cir\.imaginary"):
+        read_cir([3.0, 4.0, 5.0], "complex")
+    with pytest.raises(RecordingError, match="real numbers"):
+        read_cir("3 4 5", "complex")
 
 
 def test_large_and_fractional_cirs_are_scaled(tmp_path: Path):

@@ -130,7 +130,7 @@ def test_repeated_headers_and_merged_rows_are_dropped_and_keep_the_row_numbers(t
         (every(100_000), in_unit("ms"), "unit: us"),
         (every(1 / 864_000), {}, r"unit: s, scale: 86400 \(days\)"),
         (with_cir(round(40 + 30 / (1 + n), 2) for n in range(200)), AMPLITUDES, "row 1: a CIR in dB"),
-        (with_cir((-1) ** n * 40 for n in range(200)), AMPLITUDES, "row 1: negative magnitudes .*interleaved, or complex"),
+        (with_cir((-1) ** n * 40 for n in range(200)), AMPLITUDES, "row 1: negative magnitudes .*interleaved, or complex.*cir.imaginary"),
     ],
 )  # fmt: skip
 def test_unsuitable_file_is_an_error_with_a_remedy(text: str, document: Any, message: str, tmp_path: Path):

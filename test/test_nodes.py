@@ -156,7 +156,7 @@ def test_ranges_that_cannot_be_corrected_pass_through(ros: Ros):
         ({"scale": math.inf}, Status.BAD_CIR),
         ({"range": math.nan}, Status.OUT_OF_DISTRIBUTION),
     )
-    ros.start("mitigator")
+    mitigator = ros.start("mitigator")
     publisher = ros.node.create_publisher(RangeCir, RAW, 10)
     corrected = ros.collect(RangeCorrected, CORRECTED)
     ros.find_each_other(publisher, good_message(), corrected)
@@ -171,6 +171,7 @@ def test_ranges_that_cannot_be_corrected_pass_through(ros: Ros):
         assert (answer.status, answer.correction) == (status, 0.0)
         assert np.array_equal([answer.range, answer.range_raw], [message.range] * 2, equal_nan=True)
         assert math.isinf(answer.variance) == math.isnan(message.range)
+    mitigator.wait_for_output("ranges with status BAD_CIR: a sample or the scale of the CIR is NaN")
 
 
 def test_another_node_of_the_same_name_is_reported_but_not_one_that_may_have_been_killed(

@@ -79,6 +79,10 @@ def _warm_up(corrector: Corrector) -> None:
             corrector.correct([measurement] * count)
 
 
+MAX_REASONS = 20
+"""Reasons for unusable CIRs that are logged, each once."""
+
+
 class Mitigator(ManagedNode):
     """Lifecycle: configure creates publisher and subscription, activate loads the model.
 
@@ -106,6 +110,7 @@ class Mitigator(ManagedNode):
         # A driver in the same process calls `correct` from its own thread; transitions run in the executor's.
         self._lock = threading.Lock()
         self._meter = diagnostics.RateMonitor(self.now_ns)
+        self._reasons: set[str] = set()
         refuse_errors(self, self._prepare)
         self.add_post_set_parameters_callback(self._swap)
         self.autostart()
@@ -155,6 +160,10 @@ class Mitigator(ManagedNode):
                         self.get_logger().info(f"ranges of {choice} (first: {first})")
                     else:
                         self.get_logger().warning(f"ranges are not corrected: {choice} (first: {first})")
+                is_new = corrected.status is Status.BAD_CIR and corrected.reason not in self._reasons
+                if is_new and len(self._reasons) < MAX_REASONS:
+                    self._reasons.add(corrected.reason)
+                    self.get_logger().warning(f"ranges with status BAD_CIR: {corrected.reason}")
                 if corrected.status is Status.OK and measurement.cir.power_gap_db < LINE_OF_SIGHT_DB:
                     self.health.los_m.append(corrected.correction_m - offset_m)
                 self._meter.add(now_ns - measurement.stamp_ns)

@@ -72,7 +72,8 @@ class LiveConverter:
         if (source := self._mapping.cir) is None or source.files:
             return conversion.NO_CIR
         try:
-            return conversion.read_cir(chunk.columns[source.column][row], source.samples)
+            imaginary = chunk.columns[source.imaginary][row] if source.imaginary else None
+            return conversion.read_cir(chunk.columns[source.column][row], source.samples, imaginary)
         except (RecordingError, ValueError) as error:
             self.counts[f"not a CIR: {error!s:.80}"] += 1
             return conversion.NO_CIR

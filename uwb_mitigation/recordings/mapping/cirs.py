@@ -34,20 +34,16 @@ class CirFile:
         Raises:
             RecordingError: a value is not a CIR; `where` names its row.
         """
-        names = series(source.column)
-        lists: Any = chunk.columns[names[0]]
-        if len(names) > 1:
-            kind = object if source.samples == "complex" else np.float64
-            lists = np.stack([np.asarray(chunk.columns[name], kind) for name in names], axis=1)
-            # At a PRF of 16 MHz, a CIR has 992 samples instead of 1016.
-            lists = [row[: np.flatnonzero(row == row).max(initial=-1) + 1] for row in lists]
+        kind = object if source.samples == "complex" else np.float64
+        lists = _lists(source.column, chunk, kind)
+        imaginary = _lists(source.imaginary, chunk, kind) if source.imaginary else None
         numbers = np.full(chunk.count, -1)
         for row in range(chunk.count):
             values = lists[row]
             if values is None or isinstance(values, float):
                 continue
             try:
-                cir = read_cir(values, source.samples)
+                cir = read_cir(values, source.samples, None if imaginary is None else imaginary[row])
             except (RecordingError, *UNREADABLE) as error:
                 what, valid = (
                     getattr(error, "what", f"not a CIR: {error}"),
@@ -69,6 +65,16 @@ class CirFile:
     def close(self) -> None:
         """Delete the file."""
         self._file.close()
+
+
+def _lists(column: str, chunk: Chunk, kind: type) -> Any:
+    """Return the list of each row, from one column or a series of columns."""
+    names = series(column)
+    if len(names) == 1:
+        return chunk.columns[column]
+    lists: Any = np.stack([np.asarray(chunk.columns[name], kind) for name in names], axis=1)
+    # At a PRF of 16 MHz, a CIR has 992 samples instead of 1016.
+    return [row[: np.flatnonzero(row == row).max(initial=-1) + 1] for row in lists]
 
 
 def join_by_row(ranges: ColumnDict, rows: NDArray[Any], cirs: ColumnDict, where: str) -> None:

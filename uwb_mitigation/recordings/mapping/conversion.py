@@ -410,24 +410,33 @@ def _id(text: str, is_hex: bool) -> int:
     return int(match[1])
 
 
-def read_cir(values: Any, form: str) -> Cir:
+_COMPLEX_FORMS = "cir.samples: interleaved, or complex numbers; cir.imaginary: the column of imaginary parts"
+
+
+def read_cir(values: Any, form: str, imaginary: Any = None) -> Cir:
     """Return one CIR as int16 samples with the scale that restores the values; NaN: without samples.
 
+    Args:
+        values: the samples, or their real parts.
+        form: see `CirSource.samples`.
+        imaginary: their imaginary parts; None: they are in `values`.
+
     Raises:
-        RecordingError: the values are in dB, or real and imaginary parts instead of magnitudes.
+        RecordingError: the values are in dB, real and imaginary parts instead of magnitudes, or real parts only.
         ValueError: the values are not numbers.
     """
-    if isinstance(values, str):
-        if form == "complex" and not re.search("[ij]", values):
-            form = "interleaved"  # pairs such as [[1, 2], [3, 4]]
-        values = [item.strip("[]()") for item in re.split(r"[,;\s]+", values.strip())]
-    if len(values) and isinstance(values[0], str):
-        parse: Any = complex if form == "complex" else float
-        values = [parse(str(item).replace("i", "j")) for item in values if item]
-    array = np.asarray(values)
-    if array.dtype == object and array.ndim:
-        array = np.stack(list(array))
+    if isinstance(values, str) and form == "complex" and re.search(r"[\[(][^ij]*[\[(][^ij]*$", values):
+        form = "interleaved"  # pairs such as [[1, 2], [3, 4]]
+    array = _samples(values, form)
+    if imaginary is not None:
+        form, second = "complex", _samples(imaginary, form)
+        if array.shape != second.shape:
+            what = f"{len(array)} real and {len(second)} imaginary parts"
+            raise RecordingError(what, valid="as many imaginary as real parts")
+        array = array + 1j * second
     if form == "complex":
+        if array.ndim == 1 and len(array) and not np.iscomplexobj(array):
+            raise RecordingError("real numbers instead of complex ones", valid=_COMPLEX_FORMS)
         # Rows of real and imaginary parts, or numbers.
         is_pairs = array.ndim == 2 and not np.iscomplexobj(array)
         array = (array.astype(np.float64) @ (1, 1j) if is_pairs else array).astype(np.complex128)
@@ -440,8 +449,22 @@ def read_cir(values: Any, form: str) -> Cir:
     if encoding is Encoding.MAGNITUDE and is_logarithmic(samples):
         raise RecordingError("a CIR in dB", valid=LINEAR_MAGNITUDES)
     if encoding is Encoding.MAGNITUDE and np.mean(samples < 0) > MAX_NEGATIVE:
-        raise RecordingError("negative magnitudes", valid="cir.samples: interleaved, or complex")
+        raise RecordingError("negative magnitudes", valid=_COMPLEX_FORMS)
     return Cir(samples, encoding, scale=float(scale))
+
+
+def _samples(values: Any, form: str) -> NDArray[Any]:
+    """Return numbers, or a text with numbers, as an array; see `read_cir`."""
+    if isinstance(values, str):
+        values = [item.strip("[]()") for item in re.split(r"[,;\s]+", values.strip())]
+    if len(values) and isinstance(values[0], str):
+        texts = [str(item).replace("i", "j") for item in values if item]
+        parse: Any = complex if form == "complex" and "j" in "".join(texts) else float
+        values = [parse(item) for item in texts]
+    array = np.asarray(values)
+    if array.dtype == object and array.ndim:
+        array = np.stack(list(array))
+    return array
 
 
 def filter_rows(rules: list[RowFilter], chunk: Chunk, prefix: str = "") -> dict[str, Mask]:

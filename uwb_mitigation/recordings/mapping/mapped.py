@@ -20,7 +20,7 @@ from uwb_mitigation.recordings.mapping import checks, conversion
 from uwb_mitigation.recordings.mapping.checks import median
 from uwb_mitigation.recordings.mapping.cirs import CirFile, join_by_row, join_by_time
 from uwb_mitigation.recordings.mapping.conversion import NO_CIR, UNKNOWN_ID, ColumnDict, Converter, Mask, take
-from uwb_mitigation.recordings.mapping.mapping import CirSource, FieldRule, Mapping, TableFormat, axes, series
+from uwb_mitigation.recordings.mapping.mapping import CirSource, FieldRule, Mapping, TableFormat, axes
 from uwb_mitigation.recordings.mapping.tables import TableFile, find_files
 from uwb_mitigation.types.anchors import MAX_ANCHORS, Anchor, AnchorMap
 from uwb_mitigation.types.measurement import Cir, Record, Truth
@@ -149,7 +149,7 @@ class MappedRecording(Source):
         values = {**values, **{name: FieldRule(column=rule.column) for name, rule in medians.items()}}
         converter, tables, before = Converter(values, self.names), list[ColumnDict](), 0
         dropped = Counter[str]()
-        columns = converter.columns | dict.fromkeys(series(cir.column) if cir else (), False)
+        columns = converter.columns | dict.fromkeys(cir.sample_columns if cir else (), False)
         for number, path in enumerate(paths):
             name = Path(os.path.relpath(path, self._folder)).as_posix()
             try:

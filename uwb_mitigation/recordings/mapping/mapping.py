@@ -299,6 +299,7 @@ class CirSource(TableFormat):
 
     Attributes:
         column: a column with lists, an array, or `NAME{0..1015}` for one column a sample.
+        imaginary: column of the imaginary parts, if `column` contains the real ones.
         samples: magnitude, complex (complex numbers or pairs), or interleaved (real, imaginary, real, ...).
         join: of another file; without it, its rows are those of the ranges.
         first_path_index: in the other file.
@@ -307,10 +308,22 @@ class CirSource(TableFormat):
 
     files: str | dict[str, str] = ""
     column: str = ""
+    imaginary: str = ""
     samples: Literal["magnitude", "complex", "interleaved"] = "magnitude"
     join: Join | None = None
     first_path_index: Index | None = None
     optional: bool = False
+
+    @model_validator(mode="after")
+    def _check(self) -> CirSource:
+        if self.imaginary and "samples" in self.model_fields_set:
+            raise ValueError("imaginary without samples, or samples without imaginary")
+        return self
+
+    @property
+    def sample_columns(self) -> list[str]:
+        """Return the columns with the samples."""
+        return series(self.column) + (series(self.imaginary) if self.imaginary else [])
 
 
 class Poses(TableFormat):
@@ -455,7 +468,7 @@ class Mapping(TableFormat):
     @property
     def cir_columns(self) -> list[str]:
         """Return the columns of the ranges that contain the CIR."""
-        return series(self.cir.column) if self.cir and not self.cir.files else []
+        return self.cir.sample_columns if self.cir and not self.cir.files else []
 
 
 def axes(name: str, point: Point | None) -> dict[str, FieldRule | None]:
