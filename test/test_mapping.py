@@ -166,6 +166,14 @@ def test_real_and_imaginary_parts_in_two_columns_are_complex_samples(tmp_path: P
         of("t,a,r,i,q\n", tmp_path / "z.csv", cir=cir | {"samples": "complex"})
 
 
+def test_first_paths_outside_of_the_cirs_are_a_warning(tmp_path: Path):
+    text = "t,a,r,f,c\n" + "".join(f'{n},1,2,{f},"3 4 5"\n' for n, f in enumerate((2.9, 3, 740.5)))
+    fields = PLAIN["fields"] | {"first_path_index": "f"}
+    source = of(text, tmp_path / "x.csv", fields=fields, cir={"column": "c"})
+    (warning,) = [text for text in source.warnings if "first path" in text]
+    assert warning.startswith("2 of 3 first paths are outside of their CIRs, such as 3.00 of 3 samples")
+
+
 def test_real_parts_alone_are_no_complex_samples():
     with pytest.raises(RecordingError, match=r"real numbers instead of complex ones.*cir\.imaginary"):
         read_cir([3.0, 4.0, 5.0], "complex")

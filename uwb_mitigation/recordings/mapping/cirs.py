@@ -62,6 +62,11 @@ class CirFile:
         self._file.seek(start)
         return Cir(np.frombuffer(self._file.read(2 * length), np.int16), encoding, scale=scale)
 
+    def samples(self, number: int) -> int:
+        """Return the number of samples of a CIR."""
+        _, length, encoding, _ = self._rows[number]
+        return length // (1 if encoding is Encoding.MAGNITUDE else 2)
+
     def close(self) -> None:
         """Delete the file."""
         self._file.close()

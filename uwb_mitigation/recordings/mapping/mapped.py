@@ -104,10 +104,24 @@ class MappedRecording(Source):
         self._drop(conversion.impossible_rows(self.values))
         errors_measured = bool(mapping.truth.error and not mapping.truth.range)
         self.warnings += checks.value_warnings(self.values, errors_measured=errors_measured)
+        self._check_first_paths()
         if mapping.truth.poses and not np.isfinite(self.values["tag x"]).any():
             self.warnings.append("no range is within the times of the true poses: compare the stamps")
         self.motion = self._read_motion()
         self._shift_stamps()
+
+    def _check_first_paths(self) -> None:
+        """Warn if most first paths are outside of their CIRs."""
+        index, numbers = self.values["first_path_index"], self.values["cir"]
+        rows = np.flatnonzero((numbers >= 0) & np.isfinite(index))
+        samples = np.array([self._cirs.samples(number) for number in numbers[rows].tolist()], np.int64)
+        outside = rows[index[rows] >= samples]
+        if len(outside) > len(rows) / 2:
+            example = f"{index[outside[0]]:.2f} of {self._cirs.samples(int(numbers[outside[0]]))} samples"
+            self.warnings.append(
+                f"{len(outside)} of {len(rows)} first paths are outside of their CIRs, such as {example}: if these are windows, "
+                "set first_path_index with offset: -START, the index of their first sample"
+            )
 
     def __len__(self) -> int:
         return len(self.values["stamp"])
