@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -163,22 +162,8 @@ times = st.integers(0, 2**64 - 1)
 @given(st.lists(st.tuples(times, times, st.integers(0, 2**60), st.integers(0, 10**10)), max_size=20))
 def test_arbitrary_counters_never_fail_or_give_stamps_after_the_arrival(trips):
     clock = DeviceClock()
-    now, first_us = EPOCH, 2**64
+    now = EPOCH
     for received, replied, pause, duration in trips:
         clock.exchange(now + pause, received, replied, now + pause + duration)
         now += pause + duration
-        first_us = min(first_us, replied)
-        # One nanosecond for each microsecond, which keeps the order.
-        assert clock.stamp(replied, now) <= now + replied - first_us
-
-
-@given(
-    st.lists(st.tuples(st.integers(0, 300), st.integers(-40_000_000, 40_000_000)), min_size=2, max_size=40)
-)
-def test_stamps_have_the_order_of_the_uptimes_in_any_order_of_arrival_and_with_a_host_clock_that_is_set(
-    frames,
-):
-    clock = DeviceClock()
-    stamps = {uptime_us: clock.stamp(uptime_us, EPOCH + shift_ns) for uptime_us, shift_ns in frames}
-    in_order = [stamps[uptime_us] for uptime_us in sorted(stamps)]
-    assert all(later > earlier for earlier, later in pairwise(in_order))
+        assert clock.stamp(replied, now) <= now + len(trips)

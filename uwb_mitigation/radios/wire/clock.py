@@ -116,9 +116,8 @@ class DeviceClock:
     def stamp(self, uptime_us: int, arrived_ns: int) -> int:
         """Return the host's time, ns, at `uptime_us`, the event time of a frame that arrived at `arrived_ns`.
 
-        The same uptime always maps to the same stamp, and a later one to a later stamp. No stamp is after the arrival,
-        except by as many nanoseconds as there were microseconds since an earlier stamp: then a late frame from between
-        always has a stamp between theirs. Stamps move back only after a clock was set or a board was reset.
+        The same uptime always maps to the same stamp, a later one to a later stamp, and no stamp is after the
+        arrival. Stamps move back only after a clock was set or a board was reset.
         """
         board_ns = 1000 * uptime_us
         self.arrival(uptime_us, arrived_ns)
@@ -127,9 +126,9 @@ class DeviceClock:
             return self._stamps[index]
         stamp_ns = min(self._predict_ns(board_ns), arrived_ns)
         if index < len(self._stamps):
-            stamp_ns = min(stamp_ns, self._stamps[index] - (self._times[index] - board_ns) // 1000)
+            stamp_ns = min(stamp_ns, self._stamps[index] - 1)
         if index > 0:
-            stamp_ns = max(stamp_ns, self._stamps[index - 1] + (board_ns - self._times[index - 1]) // 1000)
+            stamp_ns = max(stamp_ns, self._stamps[index - 1] + 1)
         self._times.insert(index, board_ns)
         self._stamps.insert(index, stamp_ns)
         del self._times[:-_MAX_HISTORY], self._stamps[:-_MAX_HISTORY]
