@@ -309,6 +309,8 @@ def test_lever_arm_that_contradicts_the_ranges_is_refused(site):
     )
     assert found, done.stderr
     assert [float(value) for value in found.groups()] == pytest.approx(LEVER[:2], abs=0.05)
+    options = "--height 1.0 --truth-topic /odom --lever-arm 0.4,0.1,0 --time-offset 0.3"
+    assert figures(site, "drive.mcap", options)[0]["localisation"]["lever_arm_m"] == LEVER.tolist()
 
 
 def test_lever_arm_is_the_transform_to_the_frame_of_the_ranges(site):

@@ -91,7 +91,9 @@ def test_evaluate_writes_the_documented_keys(tmp_path, recording):
     ("words", "refused"),
     [
         (("--folds", 3, "--scaling", "max"), "--folds, --scaling without --cross-validate"),
+        (("--seeds", 3), "--seeds without --cross-validate"),
         (("--cross-validate", "configuration", "--offsets", 0), "--offsets with --cross-validate"),
+        (("--cross-validate", "configuration", "--model", "x"), "--model with --cross-validate"),
     ],
 )
 def test_options_of_the_other_mode_of_evaluate_are_refused(words, refused):

@@ -92,9 +92,8 @@ def test_weights_and_scales_without_exact_integers_are_refused_by_layer():
         scales = weights.weight_scale["module2.skip"].copy()
         scales[5] = unit * np.float32(ratio)
         cases.append(({"weight_scale": weights.weight_scale | {"module2.skip": scales}}, "skip.*channel 5"))
-    for ratio in (3, np.inf, np.nan):
-        third = {"module1.sum": weights.activation_scale["first"] / np.float32(ratio)}
-        cases.append(({"activation_scale": weights.activation_scale | third}, r"module1\.sum"))
+    third = {"module1.sum": weights.activation_scale["first"] / np.float32(3)}
+    cases.append(({"activation_scale": weights.activation_scale | third}, r"module1\.sum"))
     for changes, problem in cases:
         with pytest.raises(ModelError, match=problem):
             pack(replace(weights, **changes))

@@ -178,7 +178,7 @@ def test_real_parts_alone_are_no_complex_samples():
     with pytest.raises(RecordingError, match=r"real numbers instead of complex ones.*cir\.imaginary"):
         read_cir([3.0, 4.0, 5.0], "complex")
     with pytest.raises(RecordingError, match="real numbers"):
-        read_cir("3 4 5", "complex")
+        read_cir("[[3 4 5 6]]", "complex")
 
 
 def test_large_and_fractional_cirs_are_scaled(tmp_path: Path):

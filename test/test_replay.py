@@ -35,6 +35,7 @@ from uwb_mitigation.errors import DamagedRecordingError, UwbMitigationError
 from uwb_mitigation.nodes.feeds.replay import ReplayFeed
 from uwb_mitigation.nodes.feeds.replay_clock import ReplayClock
 from uwb_mitigation.nodes.support.parameter_tables import DRIVER, RESPAWN_FOLDER, help_text
+from uwb_mitigation.nodes.support.respawn import unused_path
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.recordings.mcap import McapRecording
 from uwb_mitigation.simulation.simulated import SimulatedSource
@@ -398,6 +399,7 @@ def test_respawned_driver_records_to_a_new_file_and_does_not_repeat_a_recording_
     assert {file.name for file in tmp_path.glob("live*")} == {"live.mcap.part", "live_2.mcap", "live_3.mcap"}
     with McapRecording(tmp_path / "live_3.mcap") as recording:
         assert len(list(recording)) == 40
+    assert unused_path(Path("/dev/null")) == Path("/dev/null")
 
 
 def test_time_to_open_a_source_does_not_make_its_first_records_late():

@@ -104,6 +104,11 @@ def test_command_writes_a_bag_marked_as_simulated(tmp_path: Path, like: str) -> 
     read = McapRecording(tmp_path / "sim.mcap")
     assert read.simulated
     assert [record.measurement.cir.channel for record in read] == [5] * result["ranges"]
+    levels = [record.measurement.cir.rx_power_dbm for record in read]
+    other = CliRunner().invoke(app, [*words[:-1], "2", "--force"])
+    assert other.exit_code == 0, other.output
+    wider = [record.measurement.cir.rx_power_dbm for record in McapRecording(tmp_path / "sim.mcap")]
+    assert np.nanmean(wider) - np.nanmean(levels) > 0.5, "channel 5 is weaker than channel 2"
     again = CliRunner().invoke(app, words)
     assert "--force" in str(again.exception)
 

@@ -212,6 +212,10 @@ def test_standard_messages():
     # Newer firmware names the anchors.
     line = "AT+RANGE=tid:4,mask:03,seq:219,range:(90,210,0,0,0,0,0,0),ancid:(7,5,-1,-1,-1,-1,-1,-1)"
     assert convert.take(String(data=line))[-2:] == [(4, 7, 0.9), (4, 5, 2.1)]
+    count = len(convert.published)
+    for end in range(line.index(",ancid"), len(line)):
+        assert len(convert.take(String(data=line[:end]))) == count, "a line that is cut"
+    assert Convert("string_at").take(String(data="tid:4,seq:1,range:[110]")) == [(4, 0, 1.1)]
     message = String(data='{"tag": 1, "ranges": [{"anchor": 2, "range_m": 3}]}')
     assert Convert("string_json").take(message) == [(1, 2, 3.0)]
 

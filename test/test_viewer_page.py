@@ -343,6 +343,9 @@ def test_token_protects_page_script_and_websocket(browser: Browser, view: View) 
         open_page(browser, server)
         add_range(view, 5.2, 3)
         browser.wait("updates", lambda: len(browser.column("pairs", "anchor")) == 3)
+    with ViewerServer(view, "localhost", 0, token="generate") as server:
+        assert len(server.url.partition("?token=")[2]) > 20
+        assert fetch(server, "?token=generate", Host=f"localhost:{server.port}").status == 403
 
 
 def test_page_is_small_and_compressed(server: ViewerServer) -> None:

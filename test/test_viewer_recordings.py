@@ -258,7 +258,7 @@ def test_thinned_line_is_interrupted_only_by_gaps():
 def test_recording_without_cirs_has_no_bad_ranges_and_says_what_is_missing(tmp_path: Path):
     path = corrected_bag(tmp_path / "radio.mcap", range(60), status=Status.NO_CIR)
     page = Drawn(indexed(path))
-    assert (page.controls.marks["bad"], page.controls.marks["count"]) == ([], 0)
+    assert (page.controls.marks["bad"], page.controls.marks["faults"]) == ([], 0)
     page.send("seek", 1.0)
     assert page.controls.empty["cir"].startswith("No CIRs: the source sends none")
     assert page.cards()["Correction, whole recording"] == ("none", "the radio sends no CIRs")
@@ -267,14 +267,17 @@ def test_recording_without_cirs_has_no_bad_ranges_and_says_what_is_missing(tmp_p
 
 def test_latest_events_of_a_recording_are_shown_and_the_others_counted(bag: Path):
     view = indexed(bag)
-    hidden = view.all_data.incidents.count + 10
+    hidden, (largest,) = view.all_data.incidents.count + 10, view.all_data.incidents.largest_error
     for number in reversed(range(MAX_EVENTS + 10)):
         view.all_data.incidents.add(100.0 + number, str(number))
     controls = Drawn(view).controls
     first, *shown = controls.incidents
     assert first == (None, f"{hidden} earlier events are not shown")
-    assert shown == [(100.0 + number, str(number)) for number in range(10, MAX_EVENTS + 10)]
-    assert len(controls.marks["incidents"]) == MAX_EVENTS
+    assert shown == [largest, *((100.0 + number, str(number)) for number in range(10, MAX_EVENTS + 10))]
+    assert (len(controls.marks["incidents"]), controls.marks["events"]) == (
+        MAX_EVENTS + 1,
+        hidden + MAX_EVENTS,
+    )
 
 
 def test_strip_shows_the_minute_before_the_position(tmp_path: Path):

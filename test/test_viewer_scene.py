@@ -114,16 +114,33 @@ def test_ranges_that_the_viewer_drops_change_neither_rate_nor_losses() -> None:
 def test_share_of_lost_ranges_is_that_of_the_radio_although_the_viewer_drops_half() -> None:
     rng, scene = np.random.default_rng(1), Scene()
     for number in range(30 * 400):
-        # The radio loses one in ten; each second, the viewer drops those of half a second.
+        # The radio loses one in ten; each second, the viewer drops those of half a second. The next one arrives late.
+        late_s = 0.6 if number % 200 == 100 else 0.0
         if rng.random() < 0.1:
             continue
         if number % 200 < 100:
             scene.count_dropped(1)
         else:
-            sample = Sample(1000.0 + number / 200, 5.3, 5.1, 0.1, Status.OK, sequence=number)
-            scene.add_sample((number % 30, 7), sample)
+            sequence = number - round(200 * late_s)
+            sample = Sample(1000.0 + number / 200 - late_s, 5.3, 5.1, 0.1, Status.OK, sequence=sequence)
+            scene.add_sample((sequence % 30, 7), sample)
     lost = [history.statistics()["lost"] for history in scene.pairs.values()]
     assert np.mean(lost) == pytest.approx(10.0, abs=1.0)
+
+
+def test_outages_are_those_of_all_tags_and_losses_need_sequence_numbers() -> None:
+    scene = Scene()
+    for number in range(70 * 60):
+        if number % 350 < 70:
+            scene.count_dropped(1)
+        else:
+            sample = Sample(1000.0 + number / 700, 5.3, 5.1, 0.1, Status.OK, sequence=number // 70)
+            scene.add_sample((1, number % 70), sample)
+    assert {history.statistics()["lost"] for history in scene.pairs.values()} == {0.0}
+    scene = Scene()
+    for number in range(9):
+        scene.add_sample((1, 7), Sample(1000.0 + number, 5.3, 5.1, 0.1, Status.OK, sequence=0))
+    assert math.isnan(scene.pairs[1, 7].statistics()["lost"])
 
 
 def test_rates_depend_on_stamps_and_not_on_when_they_are_read(view: View, clock: Clock) -> None:

@@ -148,7 +148,7 @@ def select(error_sets: Sequence[HeldOut], names: Sequence[str], baseline: str) -
     """Return the simplest correction that no more complex one improves.
 
     A more complex correction must improve significantly on each separate drive, and without any on the halves of the drive; the
-    other parts must not become worse. With ground truth it must reduce the live position error, or the range error without
+    other parts must not become worse; the simplest one stays the choice, also if it is refused, until one improves on it. With ground truth it must reduce the live position error, or the range error without
     increasing the former: better ranges do not always give better positions. `HeldOut.refusal` must accept it on
     every part, if it accepts any.
 

@@ -126,7 +126,8 @@ def quantise(
 
 def _cross_validation(description: str, default: str, **limits: Any) -> Any:
     """Return an option of `evaluate --cross-validate`, which is an error without it."""
-    return typer.Option(help=f"With --cross-validate: {description}", show_default=default, **limits)
+    text = f"With --cross-validate: {description} Default: {default}."
+    return typer.Option(help=text, show_default=False, **limits)
 
 
 def evaluate(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 import threading
 import time
 from array import array
@@ -77,10 +78,6 @@ def _warm_up(corrector: Corrector) -> None:
         measurement = RangeMeasurement(0, 1, 1, 0, 0, 5.0, cir)
         for count in (1, 1, BATCH):
             corrector.correct([measurement] * count)
-
-
-MAX_REASONS = 20
-"""Reasons for unusable CIRs that are logged, each once."""
 
 
 class Mitigator(ManagedNode):
@@ -160,9 +157,10 @@ class Mitigator(ManagedNode):
                         self.get_logger().info(f"ranges of {choice} (first: {first})")
                     else:
                         self.get_logger().warning(f"ranges are not corrected: {choice} (first: {first})")
-                is_new = corrected.status is Status.BAD_CIR and corrected.reason not in self._reasons
-                if is_new and len(self._reasons) < MAX_REASONS:
-                    self._reasons.add(corrected.reason)
+                is_bad = corrected.status is Status.BAD_CIR
+                # Once for each kind of reason, whatever its numbers are.
+                if is_bad and (kind := re.sub(r"[\d.,]+", "", corrected.reason)) not in self._reasons:
+                    self._reasons.add(kind)
                     self.get_logger().warning(f"ranges with status BAD_CIR: {corrected.reason}")
                 if corrected.status is Status.OK and measurement.cir.power_gap_db < LINE_OF_SIGHT_DB:
                     self.health.los_m.append(corrected.correction_m - offset_m)

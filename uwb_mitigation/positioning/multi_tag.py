@@ -24,7 +24,7 @@ MAX_TAGS = 256
 """More tags are probably damaged numbers."""
 
 MIN_RANGES, MAX_RATE_HZ = 100, 10_000.0
-"""No radio ranges faster; stamps of more ranges at a higher rate are in another unit than nanoseconds."""
+"""No radio ranges faster; stamps of more ranges at a higher rate are in another unit than nanoseconds (microseconds: from 10 Hz)."""
 
 UNKNOWN_HEIGHT_SD_M = 0.1
 """Standard deviation of a measured height without a variance."""
@@ -223,7 +223,9 @@ class MultiTagEstimator:
             return None
         if tag is None:
             tag = self.tags[tag_id] = self._new_tag(tag_id)
-            tag.first_ns = stamp_ns
+        if not tag.ranges or stamp_ns < tag.latest_ns - NS_PER_S:
+            # The first range, or a replay that starts again.
+            tag.first_ns, tag.ranges = stamp_ns, 0
         tag.ranges += 1
         tag.is_corrected |= is_corrected
         estimate = tag.best.add(measurement)

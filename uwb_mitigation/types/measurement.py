@@ -150,7 +150,7 @@ def reason(status: int, fault: int, range_m: float, offset_m: float = 0.0) -> st
         return f"range of {range_m:,.2f} m, beyond {MAX_REACH_M:,.0f} m: divide millimetres by 1000"
     if not range_m >= 0.0:
         return f"range of {range_m:.2f} m; valid: 0 or more"
-    if range_m < offset_m:
+    if range_m < offset_m - 1e-6:
         return f"range of {range_m:.2f} m, below the offset of {offset_m:.2f} m"
     return _FAULT_TEXTS[CirFault(fault)] if fault else _STATUS_TEXTS[Status(status)]
 

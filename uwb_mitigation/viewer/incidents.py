@@ -37,10 +37,12 @@ class Incidents:
     Attributes:
         count: number of incidents.
         latest: time (s) and text of the latest `MAX_EVENTS`, in the order of time.
+        largest_error: time (s) and text of the largest error of a recording, which is always shown.
     """
 
     def __init__(self) -> None:
         self.count, self.latest = 0, list[tuple[float, str]]()
+        self.largest_error: list[tuple[float, str]] = []
         # A tag comes before its anchors.
         self._sources: BoundedDict[tuple[int | None, int | str], _Source] = BoundedDict(MAX_SOURCES)
         self._check_s = -math.inf
@@ -50,6 +52,10 @@ class Incidents:
         self.count += 1
         insort(self.latest, (time_s, text))
         del self.latest[:-MAX_EVENTS]
+
+    def all(self) -> list[tuple[float, str]]:
+        """Return what is kept, in the order of time."""
+        return sorted([*self.latest, *self.largest_error])
 
     def add_range(self, pair: Pair, time_s: float, stamp_s: float) -> None:
         """Add a range at a time; `stamp_s` is on the clock of its tag."""

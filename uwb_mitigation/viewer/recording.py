@@ -368,4 +368,4 @@ def _add_largest_error(scene: Scene) -> None:
     largest_m, time_s, (anchor_id, tag_id) = largest
     if largest_m > 0.0:
         text = f"largest {name} of a range, {largest_m:.2f} m: anchor {format_id(anchor_id)}, tag {format_id(tag_id)}"
-        scene.incidents.add(-time_s, text)
+        scene.incidents.largest_error = [(-time_s, text)]

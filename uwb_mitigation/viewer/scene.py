@@ -156,8 +156,8 @@ class Scene:
         """Remove everything except the anchors."""
         self.incidents = Incidents()
         # Stamps of different tags may come from different clocks.
-        self.latest_stamps: BoundedDict[int | None, tuple[float, float]] = BoundedDict(MAX_TAGS)
-        self._outages: BoundedDict[int | None, Rows] = BoundedDict(MAX_TAGS)
+        self.latest_stamps: BoundedDict[int | None, tuple[float, float]] = BoundedDict(MAX_PAIRS)
+        self._outages: BoundedDict[int | None, Rows] = BoundedDict(MAX_PAIRS)
         self.ranges = self.corrected = self.faults = self.dropped = 0
         self.pairs: BoundedDict[Pair, History] = BoundedDict(math.inf if self.is_whole else MAX_PAIRS)
         self.tags: BoundedDict[str, Pose] = BoundedDict(MAX_TAGS)
@@ -221,6 +221,8 @@ class Scene:
                 self.clear_history(tag_id)
         if not stamp_s < tag_latest_s:
             tag_latest_s = self.latest_stamps.add(tag_id, (stamp_s, self.clock()))[0]
+            end_s = self._outages_of(tag_id).rows[-1:, 1]
+            end_s[:] = np.minimum(end_s, stamp_s)
         self.ranges += 1
         self.corrected += sample.status.is_corrected
         self.faults += sample.status.is_fault
@@ -230,8 +232,6 @@ class Scene:
         if self.is_whole:
             history.add(sample, self.received_s, math.nan, None)
         else:
-            end_s = self._outages_of(tag_id).rows[-1:, 1]
-            end_s[:] = np.minimum(end_s, tag_latest_s)
             history.add(sample, self.received_s, self._compare_with_position(pair, sample), MAX_SAMPLES)
             history.remove_before(tag_latest_s - HISTORY_S)
         if not math.isnan(sample.true_m):
@@ -240,8 +240,9 @@ class Scene:
     def count_errors(self, errors_m: NDArray[np.float64]) -> None:
         """Count raw and corrected errors, float64 (2, n), in the histograms; NaN: the truth is unknown."""
         errors_m = errors_m[:, (np.abs(errors_m) <= MAX_RANGE_M).all(axis=0)]
-        inside_m = errors_m.clip(ERROR_EDGES_M[0], ERROR_EDGES_M[-1])
-        self.error_counts += [np.histogram(row, ERROR_EDGES_M)[0] for row in inside_m]
+        bins = len(ERROR_EDGES_M) - 1
+        rows = np.clip(np.searchsorted(ERROR_EDGES_M, errors_m, side="right") - 1, 0, bins - 1)
+        self.error_counts += [np.bincount(row, minlength=bins) for row in rows]
         self.error_sums_m += np.abs(errors_m).sum(axis=1)
         self.errors += errors_m.shape[1]
 

@@ -177,11 +177,11 @@ def _split(at_least: int, at_most: int, multiplier: int, bias: int) -> Requantis
 def solve_sum(first: np.float32, second: np.float32) -> Sum | None:
     """Return constants that reproduce `sum_table(first, second)` for all 65,536 pairs; None if none are found.
 
-    `first` and `second` are the ratios of the operands' scales to the result's. Also None if
+    `first` and `second`, above 0, are the ratios of the operands' scales to the result's. Also None if
     their sum exceeds 2, which needs more than 31 bits, or if fused and separate arithmetic differ.
     """
     ratios = np.array([first, second], np.float32).astype(np.float64)
-    if not (np.all(ratios > 0) and float(ratios.sum()) <= 2.0):
+    if float(ratios.sum()) > 2.0:
         return None
     table = sum_table(first, second).astype(np.int64)
     if not np.array_equal(table, sum_table(first, second, fused=False)):

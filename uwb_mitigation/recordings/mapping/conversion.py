@@ -165,12 +165,13 @@ class Converter:
     ids: Collection[str] = ("tag", "anchor")
 
     @property
-    def columns(self) -> dict[str, bool]:
-        """Return the columns of the table that are needed, and whether they may be missing."""
-        columns: dict[str, bool] = {}
+    def columns(self) -> dict[str, bool | None]:
+        """Return the columns of the table that are needed, and whether they may be missing; see `MessageRows`."""
+        columns: dict[str, bool | None] = {}
         for value in filter(None, self.values.values()):
-            may_be_missing = value.optional or value.or_index
-            columns |= {name: may_be_missing and columns.get(name, True) for name in value.columns}
+            columns |= {name: value.optional and columns.get(name, True) for name in value.columns}
+            if value.or_index:
+                columns[value.column] = None
         return columns
 
     @property
@@ -410,6 +411,8 @@ def _id(text: str, is_hex: bool) -> int:
     return int(match[1])
 
 
+_PAIR = re.compile(r"[\[(]\s*[-+.\de]+\s*[,;\s]\s*[-+.\de]+\s*[\])]", re.IGNORECASE)
+
 _COMPLEX_FORMS = "cir.samples: interleaved, or complex numbers; cir.imaginary: the column of imaginary parts"
 
 
@@ -425,7 +428,12 @@ def read_cir(values: Any, form: str, imaginary: Any = None) -> Cir:
         RecordingError: the values are in dB, real and imaginary parts instead of magnitudes, or real parts only.
         ValueError: the values are not numbers.
     """
-    if isinstance(values, str) and form == "complex" and re.search(r"[\[(][^ij]*[\[(][^ij]*$", values):
+    if (
+        isinstance(values, str)
+        and form == "complex"
+        and _PAIR.search(values)
+        and not _PAIR.sub("", values).strip("[](), ;")
+    ):
         form = "interleaved"  # pairs such as [[1, 2], [3, 4]]
     array = _samples(values, form)
     if imaginary is not None:

@@ -26,11 +26,12 @@ class MessageRows:
 
     Args:
         table: the mapping; with `pattern` or `text` it describes lines of text.
-        columns: {path of a field, such as `nodes[].dis`: whether it is left out if a message does not contain it}.
+        columns: {path of a field, such as `nodes[].dis`: whether it is left out if a message does not contain it; None: until a
+            message contains it, because a line that is cut must not be read as one of earlier firmware}.
     """
 
-    def __init__(self, table: TableFormat, columns: Mapping[str, bool]) -> None:
-        self._table, self._columns = table, columns
+    def __init__(self, table: TableFormat, columns: Mapping[str, bool | None]) -> None:
+        self._table, self._columns = table, dict(columns)
         self._pattern = re.compile(table.pattern) if table.pattern else None
         paths = {column: f"{table.group}.{column}" for column in columns if column != LIST_INDEX}
         steps = {column: re.split(r"\.|(\[\])", path) for column, path in paths.items()}
@@ -51,10 +52,13 @@ class MessageRows:
         for item in items:
             values: dict[str, tuple[Any, int]] = {}
             for column, path in self._paths.items():
+                may_be_missing = self._columns[column]
                 try:
                     values[column] = _walk(item, path, column), path.count("[]")
-                except RecordingError:  # noqa: PERF203
-                    if not self._columns[column]:
+                    if may_be_missing is None:
+                        self._columns[column] = False
+                except RecordingError:
+                    if may_be_missing is False or (may_be_missing is None and path[0] in item):
                         raise
                     values[column] = None, 0
             _append_rows(rows, values, 0, limit)

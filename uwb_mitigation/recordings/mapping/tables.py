@@ -100,7 +100,7 @@ class TableFile:
 
     table: TableFormat
     path: Path
-    columns: Mapping[str, bool]
+    columns: Mapping[str, bool | None]
     ids: Collection[str] = ()
     file: str = ""
     dropped: Counter[str] = field(default_factory=Counter)

@@ -175,11 +175,11 @@ function start(doc) {
     $("speed").addEventListener("change", (event) => send("speed", Number(event.target.value)));
     on("marks", () => {
       if (!controls.marks) return;
-      const {bad, count, incidents} = controls.marks;
+      const {bad, incidents, faults, events} = controls.marks;
       const mark = (share, colour, text) => `<text x="${100 * share}%" y="11" fill="${colour}">${text}</text>`;
       $("bad-marks").innerHTML = bad.map((share) => mark(share, "#d55e00", "|")).join("")
         + incidents.map((share) => mark(share, "currentColor", "\u25c6")).join("");
-      $("marks-legend").textContent = `whole recording: | ranges not OK: ${count}, \u25c6 events: ${incidents.length}`;
+      $("marks-legend").textContent = `whole recording: | ranges not OK: ${faults}, \u25c6 events: ${events}`;
     });
   }
   on("player", () => {
