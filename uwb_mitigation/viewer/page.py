@@ -146,9 +146,9 @@ class Page:
         timeline, seconds = self._view.timeline, max(player.seconds, 1e-9)
         if timeline is not None and self._state.changed("marks", timeline.is_complete):
             bad = np.unique((timeline.bad_s / seconds).round(3)).tolist()
-            found = timeline.scene.incidents
-            shares = [time_s / seconds for time_s, _ in found.all()]
-            counts = {"faults": timeline.scene.faults, "events": found.count}
+            recorded = timeline.scene.incidents
+            shares = [time_s / seconds for time_s, _ in recorded.all()]
+            counts = {"faults": timeline.scene.faults, "events": recorded.count}
             self._state.set(marks={"bad": bad, "incidents": shares} | counts)
 
     # Events ---------------------------------------------------------------------------------------------------

@@ -176,12 +176,12 @@ class Texts:
     def _incidents(self, scene: Scene) -> list[tuple[float | None, str]]:
         """Return the incidents: time in the recording, None if they are live; text."""
         incidents, now_s = self._view.all_data.incidents, scene.clock()
-        kept, shown = incidents.latest, list[tuple[float | None, str]](incidents.all())
+        latest, shown = incidents.latest, list[tuple[float | None, str]](incidents.all())
         if self._view.player is None:
             incidents.check(now_s)
-            kept = incidents.latest[-MAX_SHOWN_EVENTS:]
-            shown = [(None, f"{now_s - time_s:.0f} s ago: {text}") for time_s, text in kept]
-        hidden = incidents.count - len(kept)
+            latest = incidents.latest[-MAX_SHOWN_EVENTS:]
+            shown = [(None, f"{now_s - time_s:.0f} s ago: {text}") for time_s, text in latest]
+        hidden = incidents.count - len(latest)
         return [(None, f"{hidden} earlier events are not shown"), *shown] if hidden else shown
 
 

@@ -31,7 +31,12 @@ def activations(weights: FloatWeights, inputs: NDArray[np.float32]) -> dict[str,
         return np.maximum(sums, np.float32(0))
 
     first = shaped(architecture, inputs)
-    return evaluate(architecture, first, rectified, lambda name, one, other: one + other)
+    return evaluate(
+        architecture,
+        first,
+        rectified,
+        lambda name, first_operand, second_operand: first_operand + second_operand,
+    )
 
 
 def predict_m(weights: FloatWeights, inputs: NDArray[np.float32]) -> NDArray[np.float32]:

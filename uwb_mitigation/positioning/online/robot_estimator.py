@@ -178,19 +178,23 @@ class RobotEstimator:
         weight = math.exp(-self._rejections) / (1.0 + math.exp(min(excess, 50.0)))
         position, covariance = ranges_only.position, ranges_only.covariance
         # Python numbers are faster here than NumPy.
-        of, unseen, (x, y, _) = covariance.item, self.tag.filter.unseen.item, heading_filter.antenna
+        covariance_at, unseen_at, (x, y, _) = (
+            covariance.item,
+            self.tag.filter.unseen.item,
+            heading_filter.antenna,
+        )
         x0, y0 = position.item(0), position.item(1)
         dx, dy = x0 - x, y0 - y
         xx, xy, yy, x_yaw, y_yaw, yaw_variance = heading_filter.published_covariance()
         of_mean = weight * (1.0 - CONSTANT_SHARE)
         rest, apart = 1.0 - of_mean, weight * (1.0 - weight)
-        covariance[0, 0] = rest * of(0, 0) + of_mean * (xx + unseen(0, 0)) + apart * dx * dx
+        covariance[0, 0] = rest * covariance_at(0, 0) + of_mean * (xx + unseen_at(0, 0)) + apart * dx * dx
         covariance[0, 1] = covariance[1, 0] = (
-            rest * of(0, 1) + of_mean * (xy + unseen(0, 1)) + apart * dx * dy
+            rest * covariance_at(0, 1) + of_mean * (xy + unseen_at(0, 1)) + apart * dx * dy
         )
-        covariance[1, 1] = rest * of(1, 1) + of_mean * (yy + unseen(1, 1)) + apart * dy * dy
-        covariance[0, 2] = covariance[2, 0] = (1.0 - weight) * of(0, 2)
-        covariance[1, 2] = covariance[2, 1] = (1.0 - weight) * of(1, 2)
+        covariance[1, 1] = rest * covariance_at(1, 1) + of_mean * (yy + unseen_at(1, 1)) + apart * dy * dy
+        covariance[0, 2] = covariance[2, 0] = (1.0 - weight) * covariance_at(0, 2)
+        covariance[1, 2] = covariance[2, 1] = (1.0 - weight) * covariance_at(1, 2)
         covariance[:3, 3:] = covariance[3:, :3] = 0.0
         position[0], position[1] = x0 - weight * dx, y0 - weight * dy
         if self._area is not None:
