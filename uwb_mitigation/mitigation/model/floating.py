@@ -31,12 +31,7 @@ def activations(weights: FloatWeights, inputs: NDArray[np.float32]) -> dict[str,
         return np.maximum(sums, np.float32(0))
 
     first = shaped(architecture, inputs)
-    return evaluate(
-        architecture,
-        first,
-        rectified,
-        lambda name, first_operand, second_operand: first_operand + second_operand,
-    )
+    return evaluate(architecture, first, rectified, lambda name, a, b: a + b)
 
 
 def predict_m(weights: FloatWeights, inputs: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -178,11 +178,8 @@ class RobotEstimator:
         weight = math.exp(-self._rejections) / (1.0 + math.exp(min(excess, 50.0)))
         position, covariance = ranges_only.position, ranges_only.covariance
         # Python numbers are faster here than NumPy.
-        covariance_at, unseen_at, (x, y, _) = (
-            covariance.item,
-            self.tag.filter.unseen.item,
-            heading_filter.antenna,
-        )
+        covariance_at, unseen_at = covariance.item, self.tag.filter.unseen.item
+        x, y, _ = heading_filter.antenna
         x0, y0 = position.item(0), position.item(1)
         dx, dy = x0 - x, y0 - y
         xx, xy, yy, x_yaw, y_yaw, yaw_variance = heading_filter.published_covariance()

@@ -68,12 +68,7 @@ class Network(nn.Module):
         architecture = self.architecture
         # Channels last, see `SameConvolution`.
         first = inputs if isinstance(architecture, Mlp) else inputs[:, :, None]
-        values = evaluate(
-            architecture,
-            first,
-            self._apply_layer,
-            lambda name, first_operand, second_operand: first_operand + second_operand,
-        )
+        values = evaluate(architecture, first, self._apply_layer, lambda name, a, b: a + b)
         *_, last = values.values()
         flat = last if isinstance(architecture, Mlp) else last.transpose(1, 2).flatten(1)
         output: Tensor = self.head(self.dropout(flat))[:, 0]
