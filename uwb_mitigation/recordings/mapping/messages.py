@@ -58,7 +58,8 @@ class MessageRows:
                     if may_be_missing is None:
                         self._columns[column] = False
                 except RecordingError:
-                    if may_be_missing is False or (may_be_missing is None and path[0] in item):
+                    is_there = may_be_missing is None and isinstance(item, dict) and path[0] in item
+                    if may_be_missing is False or is_there:
                         raise
                     values[column] = None, 0
             _append_rows(rows, values, 0, limit)
