@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.types.source import Source
@@ -49,19 +50,17 @@ def open_recording(path: Path | str, *, mapping: str = "", cir: Literal["final",
         raise RecordingError(
             f"cannot be opened: {error.strerror}", where=str(path), valid=ACCEPTED
         ) from error
-    # Each format needs other packages.
     if is_bag:
-        from uwb_mitigation.recordings.mcap import McapRecording
-
-        return McapRecording(path)
+        recording: Source = _reader("mcap").McapRecording(path)
+        return recording
     if path.is_dir():
         names = {entry.name for entry in path.iterdir()}
         if names & {"trajectory.csv", "trajectory.csv.xz"} and any(map(_HANYANG_ANCHOR.fullmatch, names)):
             return open_mapped(path, "hanyang")
     if path.is_dir() or path.name.endswith((".log", ".log.xz")) or _looks_like_log(path):
-        from uwb_mitigation.recordings.decaranging import CirFrame, open_decaranging
-
-        return open_decaranging(path, cir=CirFrame(cir))
+        reader = _reader("decaranging")
+        log: Source = reader.open_decaranging(path, cir=reader.CirFrame(cir))
+        return log
     raise RecordingError("unknown kind of recording", where=str(path), valid=ACCEPTED)
 
 
@@ -72,15 +71,18 @@ def open_mapped(path: Path, mapping: str) -> MappedRecording:
         ParameterError: The mapping is invalid.
         RecordingError: The recording cannot be read with it.
     """
-    from uwb_mitigation.recordings.mapping.mapped import MappedRecording
-    from uwb_mitigation.recordings.mapping.mapping import load_mapping
-
-    table = load_mapping(mapping)
+    table = _reader("mapping.mapping").load_mapping(mapping)
     try:
-        return MappedRecording(table, path)
+        recording: MappedRecording = _reader("mapping.mapped").MappedRecording(table, path)
     except (ValueError, TypeError, LookupError, ArithmeticError, AttributeError) as error:
         what = f"the values cannot be converted: {type(error).__name__}: {error!s:.200}"
         raise RecordingError(what, where=str(path), valid=f"values as mapping {mapping} describes") from error
+    return recording
+
+
+def _reader(module: str) -> Any:
+    """Return a module of `recordings`; it is imported here, because each format needs other packages."""
+    return importlib.import_module(f"uwb_mitigation.recordings.{module}")
 
 
 def _is_bag(path: Path) -> bool:
