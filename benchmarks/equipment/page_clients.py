@@ -12,7 +12,7 @@ from bokeh.util.token import generate_jwt_token, generate_session_id
 from tornado.httpclient import HTTPRequest
 from tornado.websocket import WebSocketClientConnection, websocket_connect
 
-_TIMEOUT_S = 30.0
+_TIMEOUT_S = 120.0
 
 
 class PageClients:
