@@ -138,7 +138,9 @@ def cases(kinds: list[str], seeds: range, data: Path) -> Iterator[Case]:
                     kind, f"{anchors} anchors {seed}", lambda arguments=arguments: flat_runs(*arguments)
                 )
         elif kind == "geometry":
-            file = next(data.glob(f"*/{position_data.GEOMETRIES}"))
+            file = next(data.glob(f"*/{position_data.GEOMETRIES}"), None)
+            if file is None:
+                raise SystemExit(f"{data} has no {position_data.GEOMETRIES}: set --data")
             layouts = [layout["name"] for layout in yaml.safe_load(file.read_text())["geometries"]]
             for arguments in itertools.product([str(file)], layouts, (2, 3), seeds):
                 name = "{1} {2}-D {3}".format(*arguments)
