@@ -24,7 +24,8 @@ MAX_RANGE_M = 10_000.0
 HISTORY_S = 60.0
 """Length of the strip chart of a pair."""
 NO_DATA_S, NO_DATA_INTERVALS = 3.0, 3.0
-"""A pair or a tag has no data after this time, or after this number of its mean intervals if that is longer."""
+"""A pair or a tag has no data after this time, or after this number of its mean intervals if that is longer; without the time
+in which the viewer itself drops ranges."""
 STATISTICS, RATE_RANGES = 100, 20
 """Numbers of latest ranges in the statistics of a pair and in its rate."""
 
@@ -191,6 +192,11 @@ class History(Rows):
         """Whether the viewer itself has dropped ranges since the last one: the time until the next one is no interval."""
         outages = self._outages.rows
         return len(outages) > 0 and bool(outages[-1, 1] > self.latest_stamp_s)
+
+    def outage_s(self, age_s: float) -> float:
+        """Return for how long the viewer has dropped ranges since the last one, `age_s` ago."""
+        begin_s, end_s = np.clip(self._outages.rows.T - self.latest_stamp_s, 0.0, age_s)
+        return float((end_s - begin_s).sum())
 
     @property
     def columns(self) -> RangeColumns:

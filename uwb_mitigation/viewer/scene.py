@@ -198,7 +198,7 @@ class Scene:
     def no_data(self, history: History) -> str:
         """Return "no data for 12 s" for a pair that has stopped, else an empty string."""
         age_s = self.age_s(history)
-        return "" if age_s <= history.max_gap_s else f"no data for {age_s:.0f} s"
+        return "" if age_s - history.outage_s(age_s) <= history.max_gap_s else f"no data for {age_s:.0f} s"
 
     def history(self, pair: Pair) -> History:
         """Return the history of a pair, a new one for a new pair."""
