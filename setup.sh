@@ -54,7 +54,8 @@ install() { .venv/bin/uv pip install $quiet --python .venv/bin/python "$@"; }
 case $goal in run) ;; develop) parts+=(develop training) ;; docs) parts+=(docs) ;; *) fail "unknown goal $goal" ;; esac
 step packages
 install --constraint $lock $(printf -- '-r requirements/%s.in ' "${parts[@]}")
-install --no-deps --no-build-isolation --editable .
+# compat: a folder named uwb_mitigation, such as the one with the clone in it, does not hide the package.
+install --no-deps --no-build-isolation --config-setting editable_mode=compat --editable .
 if [ "$goal" = develop ] && ! .venv/bin/python -c "import importlib.metadata as m, sys; sys.exit(not m.version('torch').startswith('$torch'))" 2>/dev/null; then
   step torch
   # Wheels of the default index need gigabytes of CUDA.

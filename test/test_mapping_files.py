@@ -14,13 +14,17 @@ import numpy as np
 import pytest
 import yaml
 from command_line import succeed
+from pydantic import ValidationError
 from scipy.io import savemat
 from test_mapping import BOOT, MESSAGE, PLAIN, cirs_of, of, ranges_of, read, values_of, with_fields, write
 
+from uwb_mitigation.commands.support.mapped_report import missing
 from uwb_mitigation.errors import DamagedRecordingError, MissingDependencyError, RecordingError
+from uwb_mitigation.mitigation.model.choice import CirKind
 from uwb_mitigation.recordings import text_blocks
 from uwb_mitigation.recordings.formats import open_mapped
 from uwb_mitigation.recordings.mapping.mapping import load_mapping
+from uwb_mitigation.types.measurement import RadioType, Segment
 
 HEADER = "t,a,r,true\n"
 TRUE = {"truth": {"range": "true"}}
@@ -506,6 +510,20 @@ def test_wide_tables_have_one_row_for_each_pair(tmp_path: Path):
     matrix = with_fields(anchor="variable", range="value") | {"unpivot": {"value": "dist"}}
     found = values_of(read(matrix, tmp_path / "x.mat"))
     assert found == [(0.0, 1, 1, 2.5), (0.0, 1, 2, 3.5), (0.1, 1, 1, 2.6)]
+
+
+def test_models_get_the_radio_of_the_mapping_and_the_report_names_an_assumed_one(tmp_path: Path):
+    text, assumed = with_cir(np.arange(1, 200)), "no `radio`: models take the CIRs for those of a DW1000"
+    source = of(text, tmp_path / "x.csv", **AMPLITUDES)
+    assert str(CirKind.of(next(iter(source)).measurement.cir)).startswith("DW1000 IPATOV (assumed) without")
+    assert any(assumed in line for line in missing(source))
+    assert any("universal_amplitude is used" in line for line in missing(source))
+    for segment in ("IPATOV", "STS"):
+        source = of(text, tmp_path / "x.csv", **AMPLITUDES, radio="DW3000", segment=segment)
+        assert CirKind.of(next(iter(source)).measurement.cir).source == (RadioType.DW3000, Segment[segment])
+        assert not any(assumed in line for line in missing(source))
+    with pytest.raises(ValidationError, match="segment: needs radio"):
+        of(text, tmp_path / "x.csv", segment="STS")
 
 
 def test_dry_run_shows_units_errors_outliers_names_and_what_is_missing(tmp_path: Path):

@@ -66,7 +66,10 @@ class LiveConverter:
         rules = conversion.unknown_rows(values) | conversion.impossible_rows(values)
         rows_used = np.flatnonzero(conversion.count_kept(rules, chunk.count, self.counts)).tolist()
         first, self._rows_seen = self._rows_seen, self._rows_seen + chunk.count
-        return [conversion.measurement(values, row, self._cir(chunk, row), first + row) for row in rows_used]
+        kind = self._mapping.cir_kind
+        return [
+            conversion.measurement(values, row, self._cir(chunk, row), kind, first + row) for row in rows_used
+        ]
 
     def _cir(self, chunk: conversion.Chunk, row: int) -> Cir:
         if (source := self._mapping.cir) is None or source.files:

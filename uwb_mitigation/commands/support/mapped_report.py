@@ -114,6 +114,14 @@ def missing(source: MappedRecording) -> list[str]:
             f"{no_cir}: only constants and linear models correct them (networks: status NO_CIR)",
         ),
         (with_cir and unknown("first_path_index"), "no first-path index: networks need it (status BAD_CIR)"),
+        (
+            with_cir and any(map(unknown, ("preamble_count", "rx_power", "first_path_power"))),
+            "no preamble count or levels: the less accurate universal_amplitude is used (docs/background/results.md)",
+        ),
+        (
+            with_cir and source.is_radio_assumed,
+            "no `radio`: models take the CIRs for those of a DW1000's preamble",
+        ),
         (unknown("rx_power"), "no receive level: no linear model"),
         (unknown("first_path_power"), "no first-path level: no linear model of the power gap"),
         (not len(source.errors_m), "no true range: `evaluate`, `train` and `offset` cannot use it"),

@@ -21,7 +21,9 @@ from uwb_mitigation.types.measurement import (
     LINEAR_MAGNITUDES,
     Cir,
     Encoding,
+    RadioType,
     RangeMeasurement,
+    Segment,
     int16_samples,
     is_logarithmic,
 )
@@ -129,7 +131,9 @@ def take(columns: ColumnDict, rows: NDArray[Any]) -> ColumnDict:
     return constants | {name: columns.pop(name)[rows] for name in list(columns)}
 
 
-def measurement(columns: ColumnDict, row: int, cir: Cir, sequence: int) -> RangeMeasurement:
+def measurement(
+    columns: ColumnDict, row: int, cir: Cir, kind: tuple[RadioType, Segment], sequence: int
+) -> RangeMeasurement:
     """Return one range with the samples of `cir` and its own levels; `sequence` is used if the columns have none."""
 
     def number(name: str) -> float:
@@ -140,7 +144,7 @@ def measurement(columns: ColumnDict, row: int, cir: Cir, sequence: int) -> Range
     fields: dict[str, Any] = {
         "first_path_index": number("first_path_index"), "preamble_count": _integer(number("preamble_count"), 65535),
         "rx_power_dbm": number("rx_power"), "first_path_power_dbm": number("first_path_power"),
-        "channel": _integer(number("channel"), 255),
+        "channel": _integer(number("channel"), 255), "radio": kind[0], "segment": kind[1],
     }  # fmt: skip
     stamp, tag, anchor = (int(columns[name][row]) for name in ("stamp", "tag", "anchor"))
     return RangeMeasurement(stamp, tag, anchor, counter, 0, number("range"), replace(cir, **fields))

@@ -132,6 +132,11 @@ class MappedRecording(Source):
         errors: NDArray[np.float64] = self.values["range"] - self.values["true range"]
         return errors[np.isfinite(errors)]
 
+    @property
+    def is_radio_assumed(self) -> bool:
+        """Whether the mapping does not name the radio of the CIRs."""
+        return not self._mapping.radio
+
     def cir(self, row: int) -> Cir:
         """Return the samples of a range."""
         number = int(self.values["cir"][row])
@@ -141,13 +146,15 @@ class MappedRecording(Source):
         self.skipped = Counter({f"dropped: {rule}": count for rule, count in self.dropped.items()})
         self.skipped.update(self.warnings)
         values, positions = self.values, _stacked(self.values, _TAG)
+        kind = self._mapping.cir_kind
         has_position, labels = np.asarray(np.isfinite(positions).all(axis=1)), values["label"].tolist()
         for row in range(len(self)):
             true_m, label = float(values["true range"][row]), labels[row]
             has_truth = label or math.isfinite(true_m)
             truth = Truth(true_m, label, values["configuration"][row]) if has_truth else None
             position = tuple(positions[row].tolist()) if has_position[row] else None
-            yield Record(conversion.measurement(values, row, self.cir(row), row), truth, position)
+            measured = conversion.measurement(values, row, self.cir(row), kind, row)
+            yield Record(measured, truth, position)
         if self._damage:
             raise self._damage
 

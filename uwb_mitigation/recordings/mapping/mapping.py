@@ -23,6 +23,7 @@ from pydantic import (
 
 from uwb_mitigation.errors import ParameterError, did_you_mean
 from uwb_mitigation.files import read_bounded
+from uwb_mitigation.types.measurement import RadioType, Segment
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.yaml_text import parse_yaml
 
@@ -424,6 +425,7 @@ class Mapping(TableFormat):
         baud, start: baud rate of a serial port with lines, and how their output is started.
         moving: the tag moves during pauses, so they are kept.
         range_sd: standard deviation of a range, m (data sheet); 0: unknown.
+        radio, segment: of the CIRs; without `radio`, models assume the preamble of a DW1000.
     """
 
     name: str
@@ -433,6 +435,8 @@ class Mapping(TableFormat):
     simulated: bool = False
     moving: bool = True
     range_sd: float = Field(default=0.0, ge=0.0)
+    radio: Literal["", "DW1000", "DW3000", "QM35"] = ""
+    segment: Literal["IPATOV", "STS"] = "IPATOV"
     fields: Fields
     registers: Registers | None = None
     cir: CirSource | None = None
@@ -446,7 +450,16 @@ class Mapping(TableFormat):
             raise ValueError("registers: needs fields.preamble_count")
         if any(source.files and not (source.id and source.position) for source in self.anchors):
             raise ValueError("anchors: id and position are needed with files")
+        if "segment" in self.model_fields_set and not self.radio:
+            raise ValueError("segment: needs radio")
         return self
+
+    @property
+    def cir_kind(self) -> tuple[RadioType, Segment]:
+        """Return the radio and the segment of the CIRs."""
+        if not self.radio:
+            return RadioType.UNKNOWN, Segment.UNKNOWN
+        return RadioType[self.radio], Segment[self.segment]
 
     @property
     def values(self) -> dict[str, FieldRule | None]:
