@@ -92,6 +92,11 @@ def test_setup_stops_on_platforms_without_ros_wheels(machine: str, system_ros: b
     assert not (tmp_path / ".venv").exists()
 
 
+def test_script_beside_the_clone_imports_the_package(tmp_path: Path):
+    (tmp_path / "uwb_mitigation").mkdir()
+    subprocess.run([sys.executable, "-c", "from uwb_mitigation import Status"], cwd=tmp_path, check=True)
+
+
 def test_versions_agree():
     import uwb_mitigation
 
