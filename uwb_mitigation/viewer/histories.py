@@ -261,14 +261,14 @@ class History(Rows):
         return 100.0 * float(np.clip(1.0 - received / polled, 0.0, 1.0)) if polled > 0.0 else math.nan
 
     def rate_hz(self, age_s: float = 0.0) -> float:
-        """Return the rate of the last `RATE_RANGES` ranges by their stamps; NaN before the second one.
+        """Return the rate of the last `RATE_RANGES` ranges whose intervals are known, by their stamps; NaN: none is.
 
         Args:
             age_s: time since the last range by stamps; the rate decreases if this is several mean intervals, unless the viewer
                 has dropped ranges since then.
         """
-        intervals_s = self.columns.interval_s[-RATE_RANGES:][1:]
-        intervals_s = intervals_s[np.isfinite(intervals_s)]
+        intervals_s = self.columns.interval_s[-STATISTICS:][1:]
+        intervals_s = intervals_s[np.isfinite(intervals_s)][1 - RATE_RANGES :]
         span_s = float(intervals_s.sum())
         if not span_s > 0:
             return math.nan
