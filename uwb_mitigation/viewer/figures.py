@@ -61,7 +61,9 @@ Lines = Mapping[str, Mapping[str, Any]]
 _SIDES = (0, -13, "center"), (14, 7, "left"), (-14, 7, "right"), (0, 28, "center")
 """Places of a name above, right, left and below of its mark: offsets (pixels) and alignment."""
 
-_OPTIONAL = {"95 % ellipse": "width", "heading": "heading", "selected anchor": "ring"}
+_OPTIONAL = {
+    "95 % ellipse": "width", "heading": "heading", "selected anchor": "ring", "where its ranges fit": "fit_x",
+}  # fmt: skip
 """Layers of the map, and their columns that are NaN where they have nothing to show."""
 
 
@@ -286,7 +288,7 @@ class Map:
         self.shows_accuracy = False
         self._page, self._fitted = page, (False, False, False)
         # Glyphs with NaN are not drawn: without a heading, for example.
-        self._anchors = new_source("x", "y", "name", "id", "health", "label", "ring")
+        self._anchors = new_source("x", "y", "name", "id", "health", "label", "ring", "fit_x", "fit_y")
         self._tags = new_source("x", "y", "name", "colour", "width", "height", "angle", "heading")
         self._tracks = new_source("xs", "ys", "colour", "line_width", "dash", "kind")
         self._rays = new_source("x", "y", "x0", "y0", "x1", "y1", "status")
@@ -340,6 +342,13 @@ class Map:
             ("scatter", self._anchors, {
                 "size": "ring", "fill_color": None, "line_color": GREY, "line_width": 1.5, "legend_label": "selected anchor",
             }),
+            ("segment", self._anchors, {
+                "x0": "x", "y0": "y", "x1": "fit_x", "y1": "fit_y", "line_color": VERMILLION, "line_dash": "dotted", "line_width": 2,
+            }),
+            ("scatter", self._anchors, {
+                "x": "fit_x", "y": "fit_y", "marker": "square_x", "size": 13, "fill_color": None, "line_color": VERMILLION, "line_width": 2,
+                "legend_label": "where its ranges fit",
+            }),
             ("scatter", self._tags, {
                 "marker": "star", "size": 18, "fill_color": "colour", "line_color": NIGHT, "legend_label": "tag",
             }),
@@ -375,13 +384,15 @@ class Map:
             label = name[:MAX_LABEL] + (
                 f" {state[0]}" if state not in (health.UNKNOWN, health.SILENT) else ""
             )
+            fit = math.nan, math.nan
             if timeline is not None and identity in timeline.displaced:
                 label += " not here"
+                fit = timeline.displaced[identity][1].position[:2]
             elif state in (health.BAD, health.CHECK) and abs(residual_m) >= health.LONG_M:
                 # Rounded, so that the map is not drawn again for every range.
                 label += f" {residual_m:+.1f} m"
             ring = RING if identity == selected else math.nan
-            rows.append((*anchor.position[:2], name, str(identity), state, label, ring))
+            rows.append((*anchor.position[:2], name, str(identity), state, label, ring, *fit))
         if page.changed("anchors", rows):
             set_rows(self._anchors, rows)
 
@@ -459,6 +470,8 @@ class Map:
         places += [(pose.x, pose.y) for pose in scene.tags.values()]
         for track in list(self._page.view.all_data.tracks.values()):
             places += np.percentile(track.rows[:, 1:3], (2, 98), axis=0).tolist() if len(track.rows) else []
+        if timeline := self._page.view.timeline:
+            places += [anchor.position[:2] for _, anchor in timeline.displaced.values()]
         corners = np.array(places or [(0.0, 0.0), (10.0, 10.0)])
         low, high = corners.min(axis=0), corners.max(axis=0)
         # A margin for ellipses and labels; without anchors, one in which the tag can move.

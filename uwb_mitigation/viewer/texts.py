@@ -102,7 +102,7 @@ class Texts:
 
     def _pairs(self, scene: Scene) -> dict[Pair, Means]:
         """Write the table of pairs; return their means."""
-        timeline = self._view.timeline
+        displaced = self._view.timeline.displaced if self._view.timeline else {}
         rows, pairs = list[tuple[Any, ...]](), dict[Pair, Means]()
         for pair, history, sample in scene.latest():
             missing, age_s = scene.no_data(history), scene.age_s(history)
@@ -110,9 +110,12 @@ class Texts:
             means |= {
                 "rate": 0.0 if missing else history.rate_hz(scene.stamp_age_s(pair)),
                 "stopped": age_s if missing else 0.0,
-                "displaced": 0.0 if timeline is None else timeline.displaced.get(pair[0], (0.0,))[0],
+                "displaced": 0.0,
             }
-            if timeline is not None and timeline.displaced:
+            if pair[0] in displaced:
+                residual_m, place = displaced[pair[0]]
+                means |= {"displaced": residual_m, "fit_x": place.position[0], "fit_y": place.position[1]}
+            if displaced:
                 # A displaced anchor bends the track with which all are compared.
                 means |= {"residual": math.nan, "evidence": 0.0}
             pairs[pair] = means
