@@ -241,6 +241,7 @@ class LastCir(Chart):
             marks = [(cir.noise_threshold, first, -WINDOW_LEAD, page.view.window - WINDOW_LEAD)]
             is_shown = (sample >= -TRACE_BEFORE) & (sample < TRACE_AFTER)
             table = np.column_stack([sample, trace.magnitude])[is_shown]
+            message = "" if len(table) else "This CIR has no samples near its first path."
         set_rows(self._marks, marks)
         self.fill(table, message)
 
