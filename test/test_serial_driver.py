@@ -78,7 +78,9 @@ def link(tmp_path: Path) -> Path:
 def board(link: Path, *, model: bool = False, rate_hz: float = 50.0, **options) -> EmulatedBoard:
     if model:
         mitigation = Mitigation(load_bundle(default_model_path()))
-        identity = Hello(0xB0A2D, mitigation.bundle.model_id, window=mitigation.bundle.preprocessing.samples)
+        identity = Hello(
+            0xB0A2D, mitigation.bundle.model_id, window=mitigation.bundle.card.preprocessing.samples
+        )
         options |= {"corrector": mitigation, "identity": identity}
     return FaultyBoard(SimulatedSource(seed=4, count=200), rate_hz=rate_hz, link=link, **options)
 

@@ -104,7 +104,7 @@ def quantise(
     quantisation.check(source)
     check_output(output, force)
     with console.reading() as on_record:
-        dataset = recordings.load_inputs(data, source.preprocessing, on_record)
+        dataset = recordings.load_inputs(data, source.card.preprocessing, on_record)
     console.show_skipped(dataset.skipped)
     bundle, difference = quantisation.quantise_bundle(source, dataset, output)
     model_tables.show_bundle(bundle)

@@ -42,13 +42,13 @@ def export_bundle(bundle: Bundle, folder: Path) -> Path:
             exact integer constants; the message contains the reason.
         UwbMitigationError: the header cannot be written.
     """
-    if not bundle.quantised:
+    if not bundle.card.quantised:
         raise ModelError(
             "the firmware only runs int8 networks",
             where=str(bundle.path),
             valid="run `uwb-mitigation quantise`",
         )
-    weights = graph.int8_weights(bundle.model, bundle.architecture)
+    weights = graph.int8_weights(bundle.model, bundle.card.architecture)
     try:
         network = pack(weights)
     except ModelError as error:
@@ -83,7 +83,7 @@ def golden_windows(network: PackedNetwork) -> NDArray[np.float32]:
 
 def compare_with_reference(bundle: Bundle) -> int:
     """Return the number of golden vectors for which ONNX Runtime and the integer reference are not bit-identical."""
-    weights = graph.int8_weights(bundle.model, bundle.architecture)
+    weights = graph.int8_weights(bundle.model, bundle.card.architecture)
     windows = golden_windows(pack(weights))
     host_m, expected = Session(bundle).predict_m(windows), IntegerNetwork(weights).predict_m(windows)
     return int(np.sum(host_m.view(np.uint32) != expected.view(np.uint32)))
