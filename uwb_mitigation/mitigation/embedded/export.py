@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ModelError, UwbMitigationError
-from uwb_mitigation.files import write_atomically
+from uwb_mitigation.files import os_errors, write_atomically
 from uwb_mitigation.mitigation.embedded.packing import Channels, PackedNetwork, pack
 from uwb_mitigation.mitigation.model import graph
 from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard, Session
@@ -64,10 +64,8 @@ def write_header(
 ) -> Path:
     """Write `uwb_model.h` to `folder`, which is created if it does not exist; the write is atomic."""
     path = folder / MODEL_HEADER
-    try:
+    with os_errors(UwbMitigationError, "cannot be written", path):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UwbMitigationError(f"cannot be written: {error.strerror}", where=str(path)) from error
     write_atomically(path, render(network, card, model_id, golden))
     return path
 
