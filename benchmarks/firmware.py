@@ -118,7 +118,7 @@ def trained(bundle: Bundle) -> Network:
         ModelError: see `export_bundle`.
     """
     return network_of(
-        graph.int8_weights(bundle.model, bundle.architecture), bundle.card, bundle.model_id, bundle.model
+        graph.int8_weights(bundle.model, bundle.card.architecture), bundle.card, bundle.model_id, bundle.model
     )
 
 

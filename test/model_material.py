@@ -37,7 +37,7 @@ def random_weights(architecture: Architecture, seed: int = 0) -> FloatWeights:
 
 def integer_network(bundle: Bundle) -> IntegerNetwork:
     """Return the expected output of an int8 bundle."""
-    return IntegerNetwork(graph.int8_weights(bundle.model, bundle.architecture))
+    return IntegerNetwork(graph.int8_weights(bundle.model, bundle.card.architecture))
 
 
 def windows(count: int, samples: int, seed: int = 0) -> np.ndarray:

@@ -112,8 +112,8 @@ def test_train_quantize_evaluate_from_end_to_end(tmp_path, recording):
     assert run(*quantise).exit_code == 0
     assert "exists already" in str(run(*quantise).exception)
     assert run(*quantise, "--force").exit_code == 0
-    assert load_bundle(integers).quantised
-    assert load_bundle(integers).linear_bias == load_bundle(floats).linear_bias
+    assert load_bundle(integers).card.quantised
+    assert load_bundle(integers).card.linear_bias == load_bundle(floats).card.linear_bias
     result = run("evaluate", "--data", "any", "--model", integers, "--json", tmp_path / "e.json")
     assert result.exit_code == 0
     found = json.loads((tmp_path / "e.json").read_text())

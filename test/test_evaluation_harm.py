@@ -93,7 +93,7 @@ def universal() -> Mitigation:
 @pytest.fixture(scope="module")
 def calibrated(records) -> list[Record]:
     """Return the records minus the offset of the boards, which is the median error of the LOS placements."""
-    data = build_dataset(records, load_bundle(default_model_path()).preprocessing)
+    data = build_dataset(records, load_bundle(default_model_path()).card.preprocessing)
     los = data.labels == "LOS"
     placements = data.configurations[los]
     offset = float(
@@ -117,6 +117,6 @@ def test_universal_model_improves_unseen_sites(universal, calibrated):
 
 def test_universal_model_reaches_the_error_of_its_card_on_the_real_logs(apartment_reading):
     bundle = load_bundle(default_model_path())
-    found = zero_shot.evaluate_zero_shot(build_dataset(apartment_reading, bundle.preprocessing), bundle)
+    found = zero_shot.evaluate_zero_shot(build_dataset(apartment_reading, bundle.card.preprocessing), bundle)
     left = [np.abs(found.errors[f"universal{offset}"]).mean() for offset in ("_los_offset", "_offset")]
     assert left == pytest.approx([0.220, 0.209], abs=0.001)

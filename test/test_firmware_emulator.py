@@ -87,7 +87,9 @@ def check_corrections(
     """Compare the corrections of the board with those of the mitigator; return the statuses."""
     export_bundle(bundle, folder)
     image = toolchain.compile_image(folder, folder, Target.QEMU_MPS2)
-    result = emulator.run_measurements(image, measurements, bundle.architecture.samples, offset_m=offset_m)
+    result = emulator.run_measurements(
+        image, measurements, bundle.card.architecture.samples, offset_m=offset_m
+    )
     assert result.model_id == bundle.model_id
     mitigation = Mitigation(bundle, Offsets(offset_m))
     for measured, row in zip(measurements, result.records, strict=True):
@@ -96,7 +98,7 @@ def check_corrections(
         values = [expected.range_m, expected.correction_m, expected.variance_m2]
         computed = [row["range_m"], row["correction_m"], row["variance_m2"]]
         assert np.array_equal(bits(np.array(computed)), bits(np.array(values)))
-        fault, window = model_material.window_of(measured.cir, bundle.preprocessing)
+        fault, window = model_material.window_of(measured.cir, bundle.card.preprocessing)
         if not fault:
             assert np.array_equal(bits(row["window"]), bits(window))
     return set(result.records["range_status"].tolist())

@@ -47,7 +47,7 @@ def test_shipped_model_is_exported_with_its_identity(tmp_path: Path):
     assert (values["model_id"], values["k"]) == (bundle.model_id, 157)
     text = (tmp_path / values["header"]).read_text()
     assert f"0x{bundle.model_id:08x}u" in text
-    assert format_number(bundle.linear_bias.per_rx_power) in text
+    assert format_number(bundle.card.linear_bias.per_rx_power) in text
 
 
 def test_missing_tools_are_named_with_the_install_command(monkeypatch: pytest.MonkeyPatch):

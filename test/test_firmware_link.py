@@ -149,7 +149,7 @@ def test_golden_and_damaged_streams_give_the_frames_and_counts_that_python_gives
 
 
 def python_board(bundle: Bundle, mode: Mode) -> Board:
-    identity = replace(EMULATED, model_id=bundle.model_id, window=bundle.architecture.samples)
+    identity = replace(EMULATED, model_id=bundle.model_id, window=bundle.card.architecture.samples)
     return Board(identity, Mitigation(bundle), mode=mode)
 
 

@@ -82,7 +82,7 @@ def test_int8_is_close_to_float(samples):
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_model_is_unchanged_by_the_nudge(name, tmp_path):
     shipped = load_bundle(shipped_model_path(name))
-    nudged = requantisation.nudge(graph.int8_weights(shipped.model, shipped.architecture))
+    nudged = requantisation.nudge(graph.int8_weights(shipped.model, shipped.card.architecture))
     assert save_bundle(tmp_path / "again.onnx", graph.int8_model(nudged), shipped.card).model == shipped.model
 
 

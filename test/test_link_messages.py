@@ -13,7 +13,7 @@ from uwb_mitigation.radios.wire.layout import MessageType, Mode
 from uwb_mitigation.radios.wire.messages import BoardStatus, Correction, Hello, Log, SetMode, TimeSyncReply
 from uwb_mitigation.types.measurement import Cir, CorrectedBy, CorrectedRange, RangeMeasurement, Status
 
-HELLO = Hello(0xB0A2D, 0xCAFE, 157, Mode.DEVICE, 99, 3, 4224, 1, 2, 3, "uwb-nano33")
+HELLO = Hello(0xB0A2D, 0xCAFE, 99, 3, 157, 4224, 1, 2, 3, Mode.DEVICE, "uwb-nano33")
 CORRECTED = CorrectedRange(2.5, 3.0, 0.5, 0.25, Status.OK, CorrectedBy.DEVICE, 0xCAFE)
 CORRECTION = Correction(5, 1, 2, 3, 2**40 - 1, CORRECTED, 7100)
 LOG, STATUS = Log(layout.LogLevel.WARNING, "antenna délay"), BoardStatus(1, 2, 3, 4, Mode.DEVICE, 41.5)
@@ -99,5 +99,5 @@ def test_text_that_is_not_utf8_is_shown_with_replacements():
 
 def test_long_firmware_name_is_cut_between_characters():
     for text in ("ü" * 8, "x" * 15):
-        hello = Hello(1, 0, 0, Mode.HOST, 1, firmware_name=f"{text}é")
+        hello = Hello(1, boot_id=1, firmware_name=f"{text}é")
         assert messages.decode(*messages.encode(hello)).firmware_name == text

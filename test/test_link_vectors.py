@@ -66,7 +66,7 @@ MAGNITUDES = Cir(np.arange(1, 158, dtype=np.int16), Encoding.MAGNITUDE)
 FULL = Cir(np.zeros(layout.MAX_SAMPLES, np.int16), preamble_count=1)
 CORRECTED = CorrectedRange(6.75, 7.3125, 0.5625, 0.0625, Status.OK, CorrectedBy.DEVICE, 0xDEADBEEF)
 INVALID = CorrectedRange(math.nan, math.nan, 0.0, math.inf, Status.BAD_CIR, CorrectedBy.DEVICE, 0)
-HELLO = messages.Hello(0x1122334455667788, 0xDEADBEEF, 157, Mode.DEVICE, 42, 1, 4224, 1, 2, 3, "nano33")
+HELLO = messages.Hello(0x1122334455667788, 0xDEADBEEF, 42, 1, 157, 4224, 1, 2, 3, Mode.DEVICE, "nano33")
 OFFSETS = Offsets(0.125, {2: 0.25}, {2**63 + 1: -0.5}, {(7, 3): 10.0})
 NETWORK = {"role": Role.ANCHOR, "address": 0x0102030405060708, "pan": 0x1234, "anchors": (1, 2**63 + 1)}
 CHANNEL = {"channel": 2, "prf_mhz": 16, "preamble": 1024, "preamble_code": 4, "rate_kbps": 110}

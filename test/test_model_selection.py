@@ -183,7 +183,7 @@ def test_true_ranges_of_a_table_are_used(tmp_path, eight_places):
     words = ("--truth", write(tmp_path, *EIGHT_PLACES), "--recipe", "constant", "--folds", 2)
     run_or_raise("train", "--from-bag", "bag", *words, "-o", output, "--json", result)
     assert json.loads(result.read_text())["improved"]
-    assert load_bundle(output).linear_bias.offset_m == pytest.approx(0.25)
+    assert load_bundle(output).card.linear_bias.offset_m == pytest.approx(0.25)
 
 
 def test_few_configurations_start_from_the_universal_network(tmp_path, monkeypatch):

@@ -21,7 +21,7 @@ from drives import HALL, drive
 from benchmarks.position_data import real_runs
 from uwb_mitigation.commands.offline.track import mitigation, read_config
 from uwb_mitigation.commands.positioning import track
-from uwb_mitigation.commands.support.position_options import track_settings
+from uwb_mitigation.commands.support.position_options import OPTIONS
 from uwb_mitigation.commands.view import view
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.mitigation.correction import Mitigation
@@ -204,7 +204,7 @@ def test_radio_without_cirs_is_located_live_as_from_raw_ranges():
 
 @pytest.mark.parametrize("command", [track, view])
 def test_track_and_view_have_the_same_options(command):
-    assert set(signature(track_settings).parameters) <= set(signature(command).parameters)
+    assert set(OPTIONS) <= set(signature(command).parameters)
 
 
 def test_report_is_one_file_with_the_figures_of_track(imported, tmp_path: Path):

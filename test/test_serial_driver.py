@@ -78,7 +78,9 @@ def link(tmp_path: Path) -> Path:
 def board(link: Path, *, model: bool = False, rate_hz: float = 50.0, **options) -> EmulatedBoard:
     if model:
         mitigation = Mitigation(load_bundle(default_model_path()))
-        identity = Hello(0xB0A2D, mitigation.bundle.model_id, mitigation.bundle.preprocessing.samples)
+        identity = Hello(
+            0xB0A2D, mitigation.bundle.model_id, window=mitigation.bundle.card.preprocessing.samples
+        )
         options |= {"corrector": mitigation, "identity": identity}
     return FaultyBoard(SimulatedSource(seed=4, count=200), rate_hz=rate_hz, link=link, **options)
 
@@ -257,8 +259,8 @@ def test_port_without_permission_is_reported_with_the_remedy(tmp_path: Path, mon
     [
         (None, True),
         (RadioSettings(), True),
-        (RadioSettings(Role.ANCHOR), False),
-        (RadioSettings(Role.ANCHOR, report=True), True),
+        (RadioSettings(role=Role.ANCHOR), False),
+        (RadioSettings(role=Role.ANCHOR, report=True), True),
     ],
 )
 def test_board_without_ranges_causes_a_warning_unless_it_is_an_anchor(

@@ -161,7 +161,7 @@ def test_bundle_loads_and_runs(tmp_path, shape, quantised):
     model = graph.int8_model(integers) if quantised else graph.float_model(weights)
     save_bundle(tmp_path / "mlp.onnx", model, card(shape, quantised=quantised))
     bundle = load_bundle(tmp_path / "mlp.onnx")
-    assert bundle.architecture == shape
+    assert bundle.card.architecture == shape
     inputs = windows(20, 16, 3)
     expected = (
         IntegerNetwork(integers).predict_m(inputs) if quantised else floating.predict_m(weights, inputs)
@@ -186,8 +186,8 @@ def test_command_writes_both_bundles_with_the_error_by_condition(tmp_path: Path)
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output
     made, floating = (load_bundle(tmp_path / name) for name in ("a.onnx", "b.onnx"))
-    assert (made.quantised, floating.quantised) == (True, False)
-    assert made.preprocessing.scaling is Scaling.MAX
+    assert (made.card.quantised, floating.card.quantised) == (True, False)
+    assert made.card.preprocessing.scaling is Scaling.MAX
     assert made.card.source == "DW3000 STS"
     assert "experimental, no real recording was available" in made.card.origin
     ood_bands = made.card.ood_bands

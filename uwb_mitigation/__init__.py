@@ -19,60 +19,35 @@ from typing import TYPE_CHECKING, Any
 from uwb_mitigation.files import VERSION
 
 if TYPE_CHECKING:
-    from uwb_mitigation.calibration.site import SiteCalibration, calibrate
-    from uwb_mitigation.commands.offline.tracks import Tracks, track
-    from uwb_mitigation.errors import UwbMitigationError
-    from uwb_mitigation.mitigation.correction import Mitigation
-    from uwb_mitigation.mitigation.model.shipped import load_model
-    from uwb_mitigation.positioning.tag_locator import TagLocator
-    from uwb_mitigation.recordings.dataframe import to_dataframe
-    from uwb_mitigation.recordings.formats import open_recording
-    from uwb_mitigation.types.anchors import Anchor, AnchorMap, load_anchors
-    from uwb_mitigation.types.measurement import (
-        Cir,
-        CorrectedRange,
-        Encoding,
-        RadioType,
-        RangeMeasurement,
-        Record,
-        Segment,
-        Status,
-        Truth,
-    )
-    from uwb_mitigation.types.offsets import Offsets
-    from uwb_mitigation.types.tracks import Estimate
+    from uwb_mitigation.calibration.site import SiteCalibration as SiteCalibration
+    from uwb_mitigation.calibration.site import calibrate as calibrate
+    from uwb_mitigation.commands.offline.tracks import Tracks as Tracks
+    from uwb_mitigation.commands.offline.tracks import track as track
+    from uwb_mitigation.errors import UwbMitigationError as UwbMitigationError
+    from uwb_mitigation.mitigation.correction import Mitigation as Mitigation
+    from uwb_mitigation.mitigation.model.shipped import load_model as load_model
+    from uwb_mitigation.positioning.tag_locator import TagLocator as TagLocator
+    from uwb_mitigation.recordings.dataframe import to_dataframe as to_dataframe
+    from uwb_mitigation.recordings.formats import open_recording as open_recording
+    from uwb_mitigation.types.anchors import Anchor as Anchor
+    from uwb_mitigation.types.anchors import AnchorMap as AnchorMap
+    from uwb_mitigation.types.anchors import load_anchors as load_anchors
+    from uwb_mitigation.types.measurement import Cir as Cir
+    from uwb_mitigation.types.measurement import CorrectedRange as CorrectedRange
+    from uwb_mitigation.types.measurement import Encoding as Encoding
+    from uwb_mitigation.types.measurement import RadioType as RadioType
+    from uwb_mitigation.types.measurement import RangeMeasurement as RangeMeasurement
+    from uwb_mitigation.types.measurement import Record as Record
+    from uwb_mitigation.types.measurement import Segment as Segment
+    from uwb_mitigation.types.measurement import Status as Status
+    from uwb_mitigation.types.measurement import Truth as Truth
+    from uwb_mitigation.types.offsets import Offsets as Offsets
+    from uwb_mitigation.types.tracks import Estimate as Estimate
 
 __version__ = VERSION
 
 # ONNX Runtime reads this when it is imported. By default it stores a device id in ~/.cache and sends usage data to Microsoft.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
-
-__all__ = [
-    "Anchor",
-    "AnchorMap",
-    "Cir",
-    "CorrectedRange",
-    "Encoding",
-    "Estimate",
-    "Mitigation",
-    "Offsets",
-    "RadioType",
-    "RangeMeasurement",
-    "Record",
-    "Segment",
-    "SiteCalibration",
-    "Status",
-    "TagLocator",
-    "Tracks",
-    "Truth",
-    "UwbMitigationError",
-    "calibrate",
-    "load_anchors",
-    "load_model",
-    "open_recording",
-    "to_dataframe",
-    "track",
-]
 
 _MODULES = {
     name: module
@@ -96,6 +71,8 @@ _MODULES = {
     for name in names
 }
 """Modules of the lazy names."""
+
+__all__ = list(_MODULES)
 
 
 def __getattr__(name: str) -> Any:

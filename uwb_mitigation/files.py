@@ -4,13 +4,22 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from uwb_mitigation.errors import UwbMitigationError
 
 VERSION = "0.1.0"
 """Version of this package; files that it writes state it."""
+
+
+@contextlib.contextmanager
+def os_errors(kind: type[UwbMitigationError], what: str, where: object, valid: str = "") -> Iterator[None]:
+    """Raise an error of type `kind` for an OSError of the block: what happened, and the reason."""
+    try:
+        yield
+    except OSError as error:
+        raise kind(f"{what}: {error.strerror}", where=str(where), valid=valid) from error
 
 
 def read_bounded(path: Path, limit: int, error: type[UwbMitigationError], valid: str = "") -> bytes:
@@ -25,13 +34,11 @@ def read_bounded(path: Path, limit: int, error: type[UwbMitigationError], valid:
     Raises:
         UwbMitigationError: of the type `error`: the file is missing, unreadable, empty or larger.
     """
-    try:
+    with os_errors(error, "cannot be read", path, valid):
         if not path.is_file():
             raise error("no such file", where=str(path), valid=valid)
         with path.open("rb") as stream:
             data = stream.read(limit + 1)
-    except OSError as problem:
-        raise error(f"cannot be read: {problem.strerror}", where=str(path), valid=valid) from problem
     if not data:
         raise error("the file is empty", where=str(path), valid=valid)
     if len(data) > limit:

@@ -96,6 +96,6 @@ def _firmware(model: Path | None) -> tuple[Hello, Mitigation | None]:
     from uwb_mitigation.mitigation.model.bundle import load_bundle
 
     bundle = load_bundle(model)
-    return replace(EMULATED, model_id=bundle.model_id, window=bundle.preprocessing.samples), Mitigation(
+    return replace(EMULATED, model_id=bundle.model_id, window=bundle.card.preprocessing.samples), Mitigation(
         bundle
     )

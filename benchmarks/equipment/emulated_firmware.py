@@ -62,7 +62,7 @@ class EmulatedFirmware:
         require_tools()
         self._folder = tempfile.TemporaryDirectory(prefix="uwb_emulated_firmware_")
         self._encoder = FrameEncoder()
-        self._samples = bundle.preprocessing.samples
+        self._samples = bundle.card.preprocessing.samples
         self._lead = SEARCH_TAPS + NOISE_TAPS if bundle.card.early_path else WINDOW_LEAD
         self._process: subprocess.Popen[bytes] | None = None
         self._radio: socket.socket | None = None

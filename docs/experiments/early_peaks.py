@@ -57,7 +57,7 @@ if __name__ == "__main__":
     bundle = load_bundle(default_model_path())
     for share in FALSE_SHARES:
         radio = FalsePeaks(*(getattr(RADIO, field.name) for field in fields(RADIO)), share=share)
-        blocks = [block_dataset(SEED, bundle.preprocessing, radio, WIDE_SHARE, n) for n in range(BLOCKS)]
+        blocks = [block_dataset(SEED, bundle.card.preprocessing, radio, WIDE_SHARE, n) for n in range(BLOCKS)]
         data = Dataset.joined(blocks)
         network_m = Session(bundle).predict_m(data.inputs)
         early_m = data.early_path_m

@@ -30,7 +30,9 @@ SHORT_PULSES = [replace(CHANNELS[number], pulse_taps=1.33) for number in (4, 7)]
 def evaluate(path: Path, channel: Channel) -> str:
     """Return the row of a channel."""
     bundle = load_bundle(path)
-    simulate = partial(block_dataset, SEED, bundle.preprocessing, replace(RADIO, channel=channel), WIDE_SHARE)
+    simulate = partial(
+        block_dataset, SEED, bundle.card.preprocessing, replace(RADIO, channel=channel), WIDE_SHARE
+    )
     data = Dataset.joined(list(map(simulate, range(BLOCKS))))
     network_m = data.with_early_paths(Session(bundle).predict_m(data.inputs)).astype(np.float32)
     corrections = correct_with_card(data, bundle.card, network_m)

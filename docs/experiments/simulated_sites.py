@@ -23,7 +23,7 @@ if __name__ == "__main__":
             f"{path.name}, model {bundle.model_id:08x}: ranges, raw, minus constant, corrected, passed through"
         )
         for boards, wide_share in (("usual", 0.0), ("other", 1.0)):
-            data = building_dataset(SEED, BLOCKS, bundle.preprocessing, 2, wide_share=wide_share)
+            data = building_dataset(SEED, BLOCKS, bundle.card.preprocessing, 2, wide_share=wide_share)
             network_m = data.with_early_paths(Session(bundle).predict_m(data.inputs)).astype(np.float32)
             corrections = correct_with_card(data, bundle.card, network_m)
             constant_m = np.median(data.error_m[data.labels == "LOS"])

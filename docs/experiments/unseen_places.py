@@ -43,7 +43,7 @@ def print_one_placement(name, residuals, data, is_los):
 
 for path in map(Path, sys.argv[2:]):
     bundle = load_bundle(path)
-    data = build_dataset(records, bundle.preprocessing)
+    data = build_dataset(records, bundle.card.preprocessing)
     found = zero_shot.evaluate_zero_shot(data, bundle)
     print(f"{path.name}, model {bundle.model_id:08x}, {found.passed_through.mean():.1%} passed through")
     is_los = data.labels == zero_shot.LOS

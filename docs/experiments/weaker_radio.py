@@ -44,7 +44,7 @@ def with_level(record, level, subtracted_m):
 
 for name in sys.argv[3:]:
     mitigation = Mitigation(load_bundle(model_path(name)))
-    subtracted_m = offset_m if mitigation.bundle.linear_bias == LinearBiasModel(0.0) else 0.0
+    subtracted_m = offset_m if mitigation.bundle.card.linear_bias == LinearBiasModel(0.0) else 0.0
     print(name)
     for level in (-25, *range(-20, -8), -7, -5, 0, 3, 5, 8, 10, 15, 20):
         found = evaluate_accuracy(mitigation, (with_level(record, level, subtracted_m) for record in records))

@@ -85,7 +85,9 @@ def _made_up(kind: int, script: Script) -> bytes:
     if kind % 4 == 0:
         return script.take(script.number(1))
     if kind % 4 == 1:
-        hello = messages.Hello(1, script.number(1), 157, Mode(kind % 2), script.number(1), script.number(1))
+        hello = messages.Hello(
+            1, script.number(1), script.number(1), script.number(1), 157, mode=Mode(kind % 2)
+        )
         return encode_frame(WireFrame(1, kind & 1, script.number(1), 0, messages.encode(hello)[1]))
     frame = WireFrame(
         script.number(1) % 70,

@@ -158,7 +158,7 @@ def estimate_offset(
             placement = "" if truth is None else truth.configuration
             predicted_m = _predicted_m(mitigation, measured, result)
             model = mitigation.bundles[mitigation.choose(CirKind.of(measured.cir)).model]
-            gap_db = _power_gap_db(measured, Preprocessing(model.preprocessing.samples, Scaling.MAX))
+            gap_db = _power_gap_db(measured, Preprocessing(model.card.preprocessing.samples, Scaling.MAX))
             label = None if len(measured.cir) else "" if truth is None else truth.label
             is_los = _is_los(gap_db, label)
             offset_m = measured.range_m - predicted_m - true_m
@@ -167,7 +167,7 @@ def estimate_offset(
             groups.setdefault((measured.tag_id, measured.anchor_id, placement), []).append(sample)
     pairs = sorted({(tag, anchor) for tag, anchor, _ in groups})
     _check_pairs(pairs, without_truth, has_one_distance=distance_m is not None)
-    includes_offset = any(bundle.linear_bias != LinearBiasModel(0.0) for bundle in mitigation.bundles)
+    includes_offset = any(bundle.card.linear_bias != LinearBiasModel(0.0) for bundle in mitigation.bundles)
     limit_m = MAX_ERROR_M if includes_offset else MAX_EXCESS_M
     placements = tuple(_placement_offset(*key, groups[key], limit_m) for key in sorted(groups))
     return _combined(placements, mitigation.bundle.model_id)

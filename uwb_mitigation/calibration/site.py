@@ -235,7 +235,7 @@ class SiteCalibration:
         if model.kind == LINE:
             network = graph.float_model(scaled(float_network(universal), 0.0))
             data = _labelled(self.site, self.solution, self.level)
-            fitted = output.stem, universal.architecture, data, model.linear_bias
+            fitted = output.stem, universal.card.architecture, data, model.linear_bias
             card = replace(
                 card_of(*fitted, data, self.held_out_error_m, training), needs_cir=False, quantised=False
             )

@@ -256,7 +256,7 @@ class _RangeTable:
         return SiteData(
             anchors=self._anchors,
             table=table,
-            preprocessing=self._universal.preprocessing,
+            preprocessing=self._universal.card.preprocessing,
             has_cirs=has_cirs,
             frame_ids={tag_id: tuple(names) for tag_id, names in self._frame_ids.items()},
             skipped=self._skipped,

@@ -43,8 +43,8 @@ def export_c(
     result = {
         "header": str(header),
         "model_id": bundle.model_id,
-        "k": bundle.architecture.samples,
-        "parameters": bundle.architecture.parameters,
+        "k": bundle.card.architecture.samples,
+        "parameters": bundle.card.architecture.parameters,
         "golden_vectors": GOLDEN_VECTORS,
     }
     print_line(f"{header}: model {bundle.model_id:08x}, K = {result['k']}, {result['parameters']} parameters")

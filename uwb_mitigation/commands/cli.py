@@ -22,7 +22,6 @@ from uwb_mitigation.commands import (
     offset,
     positioning,
     process,
-    universal,
     view,
 )
 from uwb_mitigation.commands.support import console
@@ -33,7 +32,7 @@ PANELS: dict[str, dict[str, typer.Typer | Callable[..., None]]] = {
     "Positions": {"track": positioning.track, "survey": positioning.survey, "calibrate": calibrate.calibrate},
     "Models": {
         "train": model.train,
-        "train-universal": universal.train_universal,
+        "train-universal": model.train_universal,
         "quantise": model.quantise,
         "evaluate": model.evaluate,
         "offset": offset.offset,

@@ -16,6 +16,7 @@ from uwb_mitigation.commands.support.bundles import ModelOption, show_models
 from uwb_mitigation.commands.support.checks import OffsetsOption, output_option
 from uwb_mitigation.commands.support.console import JsonOption, show_table
 from uwb_mitigation.errors import ParameterError, RecordingError, UwbMitigationError
+from uwb_mitigation.files import os_errors
 
 if TYPE_CHECKING:
     from uwb_mitigation.commands.offline.process import Job, Outcome
@@ -67,7 +68,8 @@ def process(
     for place, bag in bags.items():
         jobs.append(Job(bag.absolute(), place.absolute(), path, force, radio_offsets))
         if place != output:
-            _make_folder(place.parent)
+            with os_errors(ParameterError, "cannot be created", place.parent, "a folder"):
+                place.parent.mkdir(parents=True, exist_ok=True)
 
     started = time.perf_counter()
     if scheduler is not None:
@@ -83,15 +85,6 @@ def process(
         show_models(sum((outcome.models for outcome in outcomes), Counter()))
     console.write_json(json, result)
     _raise_failures(outcomes)
-
-
-def _make_folder(path: Path) -> None:
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ParameterError(
-            f"cannot be created: {error.strerror}", where=str(path), valid="a folder"
-        ) from error
 
 
 def _process_one(job: Job) -> Outcome:

@@ -314,11 +314,11 @@ class OnnxBackend:
     def correct(self, ranges: RangeColumns, offset_m: NDArray[np.float32]) -> CorrectedColumns:
         """See `Backend`."""
         # For a live range, a batch of one, loops over Python numbers are faster than operations on arrays.
-        linear_bias, n = self.bundle.linear_bias, len(ranges)
+        linear_bias, n = self.bundle.card.linear_bias, len(ranges)
         range_m = _subtract_offset(ranges.range_m, offset_m)
         powers = (ranges.rx_power_dbm, ranges.first_path_power_dbm)
         predicted = linear_bias.predict_m(*powers)
-        faults, windows = self.bundle.preprocessing.apply(ranges)
+        faults, windows = self.bundle.card.preprocessing.apply(ranges)
         status = np.zeros(n, np.uint8)
         numbers = zip(faults.tolist(), predicted.tolist(), range_m.tolist(), strict=True)
         if all(not fault and bias == bias and 0.0 <= value <= MAX_RANGE_M for fault, bias, value in numbers):
@@ -395,7 +395,7 @@ class OnnxBackend:
         except Exception:  # After any error of ONNX Runtime, consumers must still receive the range.
             return np.full(len(windows), np.nan, np.float32), np.zeros(len(windows), np.float32)
         if self.bundle.card.early_path:
-            early_m = find_early_paths(ranges, rows, self.bundle.preprocessing.samples)
+            early_m = find_early_paths(ranges, rows, self.bundle.card.preprocessing.samples)
             for index, error_m in early_m.items():
                 if (np.float32(range_m[index]) - bias_m[index]) - error_m >= MIN_RANGE_M:
                     network_m[index] = error_m
@@ -403,7 +403,7 @@ class OnnxBackend:
         score = self._rule.score(windows, range_m, *powers)
         if self._pairs_at_rest is not None:
             ids = ranges.tag_id[rows], ranges.anchor_id[rows]
-            scaling = self.bundle.preprocessing.scaling
+            scaling = self.bundle.card.preprocessing.scaling
             self._pairs_at_rest.apply(ids, range_m, windows, scaling, predicted)
         return predicted, score
 

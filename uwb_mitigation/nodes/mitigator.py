@@ -259,15 +259,15 @@ class Mitigator(ManagedNode):
         if len(labels) > 1:
             model = f"auto: the first of {', '.join(labels)} that fits"
         limits = "; it may increase errors of other boards and at other sites"
-        if bundle.linear_bias == LinearBiasModel(0.0):
+        if bundle.card.linear_bias == LinearBiasModel(0.0):
             limits = f"; offsets of these radios: {self._offsets}"
         self.get_logger().info(f"correcting with model {model}{limits}")
 
     def _reset_offset_check(self, mitigation: Corrector) -> None:
         # A linear bias model includes the offset of the boards of its training, unless another offset is set.
-        self.health.excludes_offset = bool(self._offsets) or mitigation.bundle.linear_bias == LinearBiasModel(
-            0.0
-        )
+        self.health.excludes_offset = bool(
+            self._offsets
+        ) or mitigation.bundle.card.linear_bias == LinearBiasModel(0.0)
         self.health.los_m.clear()
 
     def _prepare(self, values: Mapping[str, Any]) -> None:

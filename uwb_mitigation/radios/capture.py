@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError
+from uwb_mitigation.files import os_errors
 from uwb_mitigation.types.measurement import Record
 from uwb_mitigation.types.source import Source
 from uwb_mitigation.types.stamps import NS_PER_S
@@ -44,12 +45,8 @@ class CaptureWriter:
     """
 
     def __init__(self, path: Path, kind: str = "UCI", boards: int = 1, limit_bytes: int = 1 << 30) -> None:
-        try:
+        with os_errors(ParameterError, "the capture cannot be written", path):
             self._file: IO[str] = path.open("w", encoding="ascii", buffering=1)
-        except OSError as error:
-            raise ParameterError(
-                f"the capture cannot be written: {error.strerror}", where=str(path)
-            ) from error
         self._free_bytes, self._users = limit_bytes, boards
         self._lock = threading.Lock()
         self._problem = ""
@@ -177,10 +174,8 @@ class Capture(Source):
                 yield from _records(session, b"", now_ns + _TAIL_NS)
 
     def _open(self) -> IO[str]:
-        try:
+        with os_errors(RecordingError, "cannot be read", self._path):
             return self._path.open(encoding="ascii", errors="replace")
-        except OSError as error:
-            raise RecordingError(f"cannot be read: {error.strerror}", where=str(self._path)) from error
 
 
 def _records(session: Session, data: bytes, now_ns: int) -> Iterator[Record]:

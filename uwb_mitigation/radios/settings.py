@@ -69,30 +69,30 @@ AGE_UNKNOWN_MS = 0xFFFFFFFF
 class RadioSettings:
     """Settings of a radio. Both ends of a link must use the same channel, PRF, code, rate, delimiter and PAN.
 
-    `wire.layout` describes the fields and their units. 0 in `tx_power` and `antenna_delay` means the value of the OTP
-    memory (of a TREK1000 board the delay for this role, channel and rate), and otherwise the manual's, or 2 x 16436 ticks;
+    `wire.layout` describes the fields, in the same order, and their units. 0 in `tx_power` and `antenna_delay` means the value of
+    the OTP memory (of a TREK1000 board the delay for this role, channel and rate), and otherwise the manual's, or 2 x 16436 ticks;
     0 in `reply_us` and `timeout_us` means the default for the tag's bus and processor, plus the duration of long frames.
     `window` counts complex samples from 5 before the first path. The models were trained without `bias_correction`.
     """
 
-    role: Role = Role.TAG
     address: int = 0
-    pan: int = 0x5542
-    channel: int = 5
-    prf_mhz: int = 64
-    preamble: int = 128
-    preamble_code: int = 0
-    rate_kbps: int = 6800
-    decawave_sfd: bool = False
-    tx_power: int = 0
     antenna_delay: int = 0
-    window: int = 157
-    anchors: tuple[int, ...] = ()
+    tx_power: int = 0
     reply_us: int = 0
     timeout_us: int = 0
     interval_us: int = 0
+    pan: int = 0x5542
+    rate_kbps: int = 6800
+    preamble: int = 128
+    window: int = 157
+    channel: int = 5
+    prf_mhz: int = 64
+    preamble_code: int = 0
+    decawave_sfd: bool = False
+    role: Role = Role.TAG
     report: bool = False
     bias_correction: bool = False
+    anchors: tuple[int, ...] = ()
 
     def check(self) -> None:
         """Raise ParameterError, with the name of the setting, for an invalid value."""

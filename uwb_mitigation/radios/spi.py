@@ -13,6 +13,7 @@ from functools import partial
 from typing import Any
 
 from uwb_mitigation.errors import LinkError, ParameterError, not_installed
+from uwb_mitigation.files import os_errors
 from uwb_mitigation.radios.dw1000.port import open_chips, read_chips
 
 SLOW_HZ, FAST_HZ = 2_000_000, 16_000_000
@@ -74,13 +75,9 @@ class SpidevBus:
             ) from error
 
     def transfer(self, header: bytes, out: bytes | None, count: int) -> bytes:
-        try:
+        with os_errors(LinkError, "was lost", self.name, "check the wiring"):
             # One message is one chip-select period: at most 4096 octets, the accumulator and 30 more.
             answer = self._spi.xfer2(list(header + (bytes(count) if out is None else out)))
-        except OSError as error:
-            raise LinkError(
-                f"was lost: {error.strerror}", where=self.name, valid="check the wiring"
-            ) from error
         return bytes(answer[len(header) :])
 
     def speed(self, fast: bool) -> None:
@@ -119,12 +116,10 @@ class SpidevBus:
         request = bytearray(
             _REQUEST.pack(line, *[0] * (_LINES - 1), flags, bytes(_LINES), b"uwb_mitigation", 1, -1)
         )
-        try:
+        with os_errors(LinkError, f"line {line}", path, "an unused GPIO"):
             chip = os.open(path, os.O_RDWR | os.O_CLOEXEC)
             try:
                 fcntl.ioctl(chip, _GET_LINE, request)
             finally:
                 os.close(chip)
-        except OSError as error:
-            raise LinkError(f"line {line}: {error.strerror}", where=path, valid="an unused GPIO") from error
         return int(_REQUEST.unpack(request)[-1])

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.files import os_errors
 from uwb_mitigation.types.source import Source
 
 if TYPE_CHECKING:
@@ -44,12 +45,8 @@ def open_recording(path: Path | str, *, mapping: str = "", cir: Literal["final",
     path = Path(path)
     if mapping:
         return open_mapped(path, mapping)
-    try:
+    with os_errors(RecordingError, "cannot be opened", path, ACCEPTED):
         is_bag = _is_bag(path)
-    except OSError as error:
-        raise RecordingError(
-            f"cannot be opened: {error.strerror}", where=str(path), valid=ACCEPTED
-        ) from error
     if is_bag:
         recording: Source = _reader("mcap").McapRecording(path)
         return recording

@@ -124,7 +124,7 @@ def compare_models(
     names = NAMES if dataset.has_cirs else NAMES_WITHOUT_CIRS
     errors_by_row = {name: np.array([by_seed.errors[name] for by_seed in held_out]) for name in names}
     universal_coverage = None
-    if universal is not None and universal.preprocessing == dataset.preprocessing and dataset.has_cirs:
+    if universal is not None and universal.card.preprocessing == dataset.preprocessing and dataset.has_cirs:
         unknown_site = zero_shot.evaluate_zero_shot(dataset, universal)
         errors_by_row |= {name: error[None] for name, error in unknown_site.errors.items()}
         universal_coverage = _coverage(dataset.labels, "universal_los_offset", [unknown_site])

@@ -89,47 +89,39 @@ FAULTS = tuple(status for status in Status if status.is_fault)
 """Statuses that need attention."""
 
 
+LINEAR_MAGNITUDES = "linear magnitudes: 10 ** (level / 20)"
+
+
 class CirFault(enum.IntEnum):
     """Reason why a channel impulse response is unusable; up to NO_POWER the values of `uwb_status` in the firmware.
 
     The firmware does not distinguish TOO_SHORT from OUTSIDE, and gets no magnitudes in dB from its radio.
     """
 
-    EMPTY = 3
-    ODD_LENGTH = 4
-    BAD_SCALE = 5
-    NO_FIRST_PATH = 6
-    OUTSIDE = 7
-    ALL_ZERO = 8
-    NEGATIVE = 9
-    SATURATED = 10
-    NO_PREAMBLE_COUNT = 11
-    NO_POWER = 12
-    TOO_SHORT = 13
-    DECIBELS = 14
+    EMPTY = 3, "the CIR has no samples"
+    ODD_LENGTH = 4, "a complex CIR has an odd number of values"
+    BAD_SCALE = 5, "a sample or the scale of the CIR is NaN, infinite, or outside of float32"
+    NO_FIRST_PATH = 6, "the first-path index is not finite"
+    OUTSIDE = 7, "the first-path index is outside the CIR"
+    ALL_ZERO = 8, "the window contains only zeros"
+    NEGATIVE = 9, "a magnitude is negative"
+    SATURATED = 10, "the window contains a saturated sample"
+    NO_PREAMBLE_COUNT = 11, "the preamble count is unknown, and the model's scaling needs it"
+    NO_POWER = 12, "the receive or first-path power is unknown, and the model needs it"
+    TOO_SHORT = (
+        13,
+        "the CIR is too short before or after the first path: the window around it is partly outside",
+    )
+    DECIBELS = 14, f"the CIR is in dB; valid: {LINEAR_MAGNITUDES}"
 
-    @property
-    def text(self) -> str:
-        """The reason as text."""
-        return _FAULT_TEXTS[self]
+    text: str
 
+    def __new__(cls, value: int, text: str = "") -> CirFault:
+        """Return a member with its reason as text."""
+        member = int.__new__(cls, value)
+        member._value_, member.text = value, text
+        return member
 
-LINEAR_MAGNITUDES = "linear magnitudes: 10 ** (level / 20)"
-
-_FAULT_TEXTS = {
-    CirFault.EMPTY: "the CIR has no samples",
-    CirFault.ODD_LENGTH: "a complex CIR has an odd number of values",
-    CirFault.BAD_SCALE: "a sample or the scale of the CIR is NaN, infinite, or outside of float32",
-    CirFault.NO_FIRST_PATH: "the first-path index is not finite",
-    CirFault.OUTSIDE: "the first-path index is outside the CIR",
-    CirFault.ALL_ZERO: "the window contains only zeros",
-    CirFault.NEGATIVE: "a magnitude is negative",
-    CirFault.SATURATED: "the window contains a saturated sample",
-    CirFault.NO_PREAMBLE_COUNT: "the preamble count is unknown, and the model's scaling needs it",
-    CirFault.NO_POWER: "the receive or first-path power is unknown, and the model needs it",
-    CirFault.TOO_SHORT: "the CIR is too short before or after the first path: the window around it is partly outside",
-    CirFault.DECIBELS: f"the CIR is in dB; valid: {LINEAR_MAGNITUDES}",
-}
 
 MAX_REACH_M = 1000.0
 """A radio reaches a few hundred metres: larger numbers are probably millimetres."""
@@ -152,12 +144,12 @@ def reason(status: int, fault: int, range_m: float, offset_m: float = 0.0) -> st
         return f"range of {range_m:.2f} m; valid: 0 or more"
     if range_m < offset_m - 1e-6:
         return f"range of {range_m:.2f} m, below the offset of {offset_m:.2f} m"
-    return _FAULT_TEXTS[CirFault(fault)] if fault else _STATUS_TEXTS[Status(status)]
+    return CirFault(fault).text if fault else _STATUS_TEXTS[Status(status)]
 
 
 _STATUS_TEXTS = {
-    Status.NO_CIR: _FAULT_TEXTS[CirFault.EMPTY],
-    Status.BAD_CIR: _FAULT_TEXTS[CirFault.NO_POWER],  # not a fault of the samples
+    Status.NO_CIR: CirFault.EMPTY.text,
+    Status.BAD_CIR: CirFault.NO_POWER.text,  # not a fault of the samples
     Status.OUT_OF_DISTRIBUTION: "unlike the training data of the model",
     Status.MODEL_ERROR: "the network failed",
 }

@@ -120,7 +120,7 @@ def show_held_out(held_out: Mapping[str, Mapping[str, ErrorStatistics]]) -> None
 
 def show_bundle(bundle: Bundle) -> None:
     """Show file, size and id of a bundle."""
-    kind = "int8" if bundle.quantised else "float32"
+    kind = "int8" if bundle.card.quantised else "float32"
     print_line(f"{bundle.path}: {kind}, {len(bundle.model)} bytes, model id {bundle.model_id:08x}")
 
 

@@ -27,62 +27,34 @@ AnchorsOption = Annotated[
 ]
 
 
-def track_settings(
-    height: Annotated[
-        float | None,
-        typer.Option(help="Height of the tag's antenna in the anchors' frame, m, where it stays the same."),
-    ] = None,
-    height_sd: Annotated[float, typer.Option(help="Standard deviation of the height, m.")] = 0.1,
-    height_topic: Annotated[
-        str | None,
-        typer.Option(
-            metavar="TOPIC",
-            help="Topic of BAG with the measured height of the tag's antenna (Range above z = 0, Odometry or "
-            "PoseWithCovarianceStamped). --height-sd is used if a message has no variance.",
-        ),
-    ] = None,
-    area: Annotated[
-        str | None,
-        typer.Option(
-            metavar="X,Y,Z,X,Y,Z", help="Where tags can be: the lower and the upper corner of a box, m."
-        ),
-    ] = None,
-    odometry: Annotated[
-        str | None,
-        typer.Option(
-            metavar="TOPIC",
-            help="Odometry of the robot with the tag (nav_msgs/Odometry): also estimate its heading.",
-        ),
-    ] = None,
-    imu: Annotated[
-        str | None,
-        typer.Option(
-            metavar="TOPIC",
-            help="With --odometry: IMU of the robot (sensor_msgs/Imu); its yaw rate replaces that of the odometry.",
-        ),
-    ] = None,
-    lever_arm: Annotated[
-        str | None,
-        typer.Option(
-            metavar="X,Y,Z",
-            help="With --odometry: the antenna in the robot's frame, m. Default: from the transforms of the bag, otherwise 0.",
-        ),
-    ] = None,
-    stamp_offset: Annotated[
-        float,
-        typer.Option(help="Time to add to the stamps of the ranges, s; -0.2 if they are late by 0.2 s."),
-    ] = 0.0,
-    acceleration: Annotated[
-        float,
-        typer.Option(
-            help="Agility of the tags: 0.8 for robots, people and drones, less for slow vehicles. Square root of the spectral "
-            "density of the acceleration, m/s^1.5."
-        ),
-    ] = 0.8,
-    model: ModelOption = None,
-    offsets: OffsetsOption = None,
-) -> TrackSettings:
-    """Return the settings that the options describe.
+def _option(default: Any, kind: Any, metavar: str | None, text: str) -> tuple[Any, Any]:
+    """Return the default and the annotation of an option."""
+    return default, Annotated[kind, typer.Option(metavar=metavar, help=text)]
+
+
+OPTIONS: dict[str, tuple[Any, Any]] = {
+    "height": _option(None, float | None, None, "Height of the tag's antenna in the anchors' frame, m, where it stays the same."),
+    "height_sd": _option(0.1, float, None, "Standard deviation of the height, m."),
+    "height_topic": _option(None, str | None, "TOPIC", "Topic of BAG with the measured height of the tag's antenna (Range above "
+                            "z = 0, Odometry or PoseWithCovarianceStamped). --height-sd is used if a message has no variance."),
+    "area": _option(None, str | None, "X,Y,Z,X,Y,Z", "Where tags can be: the lower and the upper corner of a box, m."),
+    "odometry": _option(None, str | None, "TOPIC", "Odometry of the robot with the tag (nav_msgs/Odometry): also estimate its "
+                        "heading."),
+    "imu": _option(None, str | None, "TOPIC", "With --odometry: IMU of the robot (sensor_msgs/Imu); its yaw rate replaces that of "
+                   "the odometry."),
+    "lever_arm": _option(None, str | None, "X,Y,Z", "With --odometry: the antenna in the robot's frame, m. Default: from the "
+                         "transforms of the bag, otherwise 0."),
+    "stamp_offset": _option(0.0, float, None, "Time to add to the stamps of the ranges, s; -0.2 if they are late by 0.2 s."),
+    "acceleration": _option(0.8, float, None, "Agility of the tags: 0.8 for robots, people and drones, less for slow vehicles. "
+                            "Square root of the spectral density of the acceleration, m/s^1.5."),
+    "model": (None, ModelOption),
+    "offsets": (None, OffsetsOption),
+}  # fmt: skip
+"""The default and the annotation of the options that `TrackSettings` has as fields."""
+
+
+def track_settings(**values: Any) -> TrackSettings:
+    """Return the settings that some of the `OPTIONS` describe.
 
     Raises:
         ParameterError: an option is invalid, or two options exclude each other.
@@ -91,25 +63,34 @@ def track_settings(
     from uwb_mitigation.positioning.track_settings import TrackSettings
     from uwb_mitigation.types.offsets import NO_OFFSETS
 
-    motion = odometry, imu, parse_lever_arm(lever_arm), stamp_offset, acceleration
-    return TrackSettings(
-        height, height_sd, height_topic, Area.parse(area), *motion, model, offsets or NO_OFFSETS
-    )
+    parse: dict[str, Callable[[Any], Any]] = {
+        "area": Area.parse,
+        "lever_arm": parse_lever_arm,
+        "offsets": lambda offsets: offsets or NO_OFFSETS,
+    }
+    values |= {name: parse[name](values[name]) for name in parse.keys() & values.keys()}
+    units = dict.fromkeys(("height", "height_sd", "lever_arm"), "_m") | {"stamp_offset": "_s"}
+    return TrackSettings(**{name + units.get(name, ""): value for name, value in values.items()})
 
 
 def with_settings(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command the options of `track_settings` instead of its parameter `settings`; `names`: only these options."""
+    """Give a command the `OPTIONS` instead of its parameter `settings`; `names`: only these options."""
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
-        shared = _parameters(track_settings)
-        shared = {name: shared[name] for name in names or shared}
+        hints = get_type_hints(command, localns={"TrackSettings": object}, include_extras=True)
+        options = names or tuple(OPTIONS)
         parameters = list[inspect.Parameter]()
-        for name, parameter in _parameters(command).items():
-            parameters += shared.values() if name == "settings" else [parameter]
+        for name, parameter in inspect.signature(command).parameters.items():
+            shared = {option: OPTIONS[option] for option in options}
+            own = {name: (parameter.default, hints[name])}
+            parameters += [
+                parameter.replace(name=option, default=default, annotation=annotation)
+                for option, (default, annotation) in (shared if name == "settings" else own).items()
+            ]
 
         @functools.wraps(command)
         def wrapper(**values: Any) -> None:
-            settings = track_settings(**{name: values.pop(name) for name in shared})
+            settings = track_settings(**{name: values.pop(name) for name in options})
             command(settings=settings, **values)
 
         wrapper.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
@@ -117,10 +98,3 @@ def with_settings(*names: str) -> Callable[[Callable[..., None]], Callable[..., 
         return wrapper
 
     return decorate
-
-
-def _parameters(function: Callable[..., Any]) -> dict[str, inspect.Parameter]:
-    """Return the parameters with their types instead of the texts of these."""
-    hints = get_type_hints(function, localns={"TrackSettings": object}, include_extras=True)
-    parameters = inspect.signature(function).parameters
-    return {name: parameter.replace(annotation=hints[name]) for name, parameter in parameters.items()}

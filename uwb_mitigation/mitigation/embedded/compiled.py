@@ -148,7 +148,7 @@ class FirmwareBackend:
             strict=True,
         )
         # The firmware returns no fault, and gets no magnitudes in dB on a board.
-        faults, _ = self.bundle.preprocessing.apply(ranges)
+        faults, _ = self.bundle.card.preprocessing.apply(ranges)
         statuses = np.where(faults == CirFault.DECIBELS, Status.BAD_CIR, status).astype(np.uint8)
         corrected = pass_through(self.bundle, ranges, offset_m, statuses, faults)
         is_corrected = np.isin(corrected.status, CORRECTED)

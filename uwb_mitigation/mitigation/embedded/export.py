@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ModelError, UwbMitigationError
-from uwb_mitigation.files import write_atomically
+from uwb_mitigation.files import os_errors, write_atomically
 from uwb_mitigation.mitigation.embedded.packing import Channels, PackedNetwork, pack
 from uwb_mitigation.mitigation.model import graph
 from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard, Session
@@ -42,13 +42,13 @@ def export_bundle(bundle: Bundle, folder: Path) -> Path:
             exact integer constants; the message contains the reason.
         UwbMitigationError: the header cannot be written.
     """
-    if not bundle.quantised:
+    if not bundle.card.quantised:
         raise ModelError(
             "the firmware only runs int8 networks",
             where=str(bundle.path),
             valid="run `uwb-mitigation quantise`",
         )
-    weights = graph.int8_weights(bundle.model, bundle.architecture)
+    weights = graph.int8_weights(bundle.model, bundle.card.architecture)
     try:
         network = pack(weights)
     except ModelError as error:
@@ -64,10 +64,8 @@ def write_header(
 ) -> Path:
     """Write `uwb_model.h` to `folder`, which is created if it does not exist; the write is atomic."""
     path = folder / MODEL_HEADER
-    try:
+    with os_errors(UwbMitigationError, "cannot be written", path):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UwbMitigationError(f"cannot be written: {error.strerror}", where=str(path)) from error
     write_atomically(path, render(network, card, model_id, golden))
     return path
 
@@ -83,7 +81,7 @@ def golden_windows(network: PackedNetwork) -> NDArray[np.float32]:
 
 def compare_with_reference(bundle: Bundle) -> int:
     """Return the number of golden vectors for which ONNX Runtime and the integer reference are not bit-identical."""
-    weights = graph.int8_weights(bundle.model, bundle.architecture)
+    weights = graph.int8_weights(bundle.model, bundle.card.architecture)
     windows = golden_windows(pack(weights))
     host_m, expected = Session(bundle).predict_m(windows), IntegerNetwork(weights).predict_m(windows)
     return int(np.sum(host_m.view(np.uint32) != expected.view(np.uint32)))

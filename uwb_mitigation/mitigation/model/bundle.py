@@ -161,26 +161,6 @@ class Bundle:
         """Name of the model."""
         return self.card.name
 
-    @property
-    def architecture(self) -> Architecture:
-        """Architecture of the network."""
-        return self.card.architecture
-
-    @property
-    def preprocessing(self) -> Preprocessing:
-        """Preprocessing of the CIR."""
-        return self.card.preprocessing
-
-    @property
-    def linear_bias(self) -> LinearBiasModel:
-        """Linear bias model."""
-        return self.card.linear_bias
-
-    @property
-    def quantised(self) -> bool:
-        """Whether the network is int8."""
-        return self.card.quantised
-
 
 @lru_cache(8)
 def _unpickled(model: bytes, path: Path) -> Bundle:

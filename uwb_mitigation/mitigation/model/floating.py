@@ -50,12 +50,12 @@ def float_network(source: Bundle) -> FloatWeights:
     Raises:
         ModelError: it is not a REMNet.
     """
-    if not isinstance(source.architecture, Remnet):
+    if not isinstance(source.card.architecture, Remnet):
         raise ModelError("no REMNet to start from", where=str(source.path), valid="a bundle of `train`")
-    if not source.quantised:
-        return graph.float_weights(source.model, source.architecture)
-    integers = graph.int8_weights(source.model, source.architecture)
-    inputs = inputs_of(source.architecture)
+    if not source.card.quantised:
+        return graph.float_weights(source.model, source.card.architecture)
+    integers = graph.int8_weights(source.model, source.card.architecture)
+    inputs = inputs_of(source.card.architecture)
     weight, bias = {}, {}
     for layer, values in integers.weight.items():
         scale = integers.weight_scale[layer]
@@ -63,7 +63,7 @@ def float_network(source: Bundle) -> FloatWeights:
         weight[layer] = (values * shaped).astype(np.float32)
         unit = integers.activation_scale[inputs[layer][0]] * scale
         bias[layer] = (integers.bias[layer] * unit).astype(np.float32)
-    return FloatWeights(source.architecture, weight, bias)
+    return FloatWeights(source.card.architecture, weight, bias)
 
 
 def scaled(network: FloatWeights, factor: float) -> FloatWeights:

@@ -42,21 +42,21 @@ from uwb_mitigation.types.offsets import Offsets
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """Identity and state of a board; the fields of `layout.PAYLOADS[HELLO]`.
+    """Identity and state of a board; the fields of `layout.PAYLOADS[HELLO]`, in the same order.
 
     `firmware_name` has at most 16 bytes of UTF-8; longer names are truncated.
     """
 
     board_id: int = 0
     model_id: int = 0
-    window: int = 0
-    mode: Mode = Mode.HOST
     boot_id: int = 0
     request_sequence: int = 0
+    window: int = 0
     max_payload: int = 0
     firmware_major: int = 0
     firmware_minor: int = 0
     firmware_patch: int = 0
+    mode: Mode = Mode.HOST
     firmware_name: str = ""
 
     @property
@@ -253,17 +253,10 @@ _ADDRESS = struct.Struct("<Q")
 # Functions that return the values of the fields of a message and its tail, and messages from values and the payload.
 
 
-def _hello_fields(m: Hello) -> tuple[Any, ...]:
-    version = m.firmware_major, m.firmware_minor, m.firmware_patch
-    identity = m.board_id, m.model_id, m.boot_id, m.request_sequence, m.window, m.max_payload
-    return (*identity, *version, m.mode, _truncate_utf8(m.firmware_name, 16), b"")
-
-
 def _hello(values: tuple[Any, ...], payload: bytes, stamp_ns: int) -> Hello:
-    board, model, boot, request, window, max_payload, major, minor, patch, mode, name = values
-    version = major, minor, patch
-    text = _text(name.rstrip(b"\0"), 0)
-    return Hello(board, model, window, _member(Mode, mode), boot, request, max_payload, *version, text)
+    *numbers, mode, name = values
+    fields: tuple[Any, ...] = (*numbers, _member(Mode, mode), _text(name.rstrip(b"\0"), 0))
+    return Hello(*fields)
 
 
 def _range_fields(m: RangeMeasurement) -> tuple[Any, ...]:
@@ -312,22 +305,17 @@ def _corrected(values: tuple[Any, ...], payload: bytes, stamp_ns: int) -> Correc
 
 def _settings_fields(s: RadioSettings) -> tuple[Any, ...]:
     """Return the common fields of RADIO and SET_RADIO, and their tail."""
-    chip = s.address, s.antenna_delay, s.tx_power
-    times = s.reply_us, s.timeout_us, s.interval_us
-    channel = s.pan, s.rate_kbps, s.preamble, s.window, s.channel, s.prf_mhz, s.preamble_code
-    flags = s.decawave_sfd, s.role, s.report, s.bias_correction, len(s.anchors)
-    return (*chip, *times, *channel, *flags, b"".join(map(_ADDRESS.pack, s.anchors)))
+    *fixed, anchors = astuple(s)
+    return (*fixed, len(anchors), b"".join(map(_ADDRESS.pack, anchors)))
 
 
 def _settings(values: tuple[Any, ...], payload: bytes, kind: int) -> RadioSettings:
     """Return the settings in the common fields and the tail."""
-    address, delay, power, reply_us, timeout_us, interval_us, pan, rate, preamble, window = values[:10]
-    channel, prf, code, decawave_sfd, role, report, bias_correction, count = values[10:]
+    *numbers, decawave_sfd, role, report, bias_correction, count = values
     anchors = tuple(anchor for (anchor,) in _rows(_ADDRESS, count, MAX_ANCHORS, payload, kind))
-    return RadioSettings(
-        _member(Role, role), address, pan, channel, prf, preamble, code, rate, bool(decawave_sfd), power, delay, window,
-        anchors, reply_us, timeout_us, interval_us, bool(report), bool(bias_correction),
-    )  # fmt: skip
+    flags = bool(decawave_sfd), _member(Role, role), bool(report), bool(bias_correction)
+    fields: tuple[Any, ...] = (*numbers, *flags, anchors)
+    return RadioSettings(*fields)
 
 
 def _radio_fields(m: RadioConfigured) -> tuple[Any, ...]:
@@ -378,7 +366,7 @@ def _offsets(values: tuple[Any, ...], payload: bytes, stamp_ns: int) -> SetOffse
 
 
 _ENCODERS: dict[type, tuple[MessageType, Callable[[Any], tuple[Any, ...]]]] = {
-    Hello: (MessageType.HELLO, _hello_fields),
+    Hello: (MessageType.HELLO, lambda m: (*astuple(m)[:-1], _truncate_utf8(m.firmware_name, 16), b"")),
     RangeMeasurement: (MessageType.RANGE_CIR, _range_fields),
     Correction: (MessageType.RANGE_CORRECTED, _corrected_fields),
     Log: (MessageType.LOG, lambda m: (m.level, m.text.encode("utf-8", "replace"))),

@@ -28,6 +28,7 @@ from mcap.stream_reader import MAGIC_SIZE, StreamReader
 from mcap.writer import MCAP0_MAGIC
 
 from uwb_mitigation.errors import DamagedRecordingError, RecordingError, did_you_mean
+from uwb_mitigation.files import os_errors
 from uwb_mitigation.recordings.bag.rosbag2 import bag_files
 from uwb_mitigation.types.ros import schemas
 
@@ -231,14 +232,11 @@ class BagReader:
                 that is truncated or fails its checksum yields none.
         """
         for path, index in zip(self.files, self._indexes, strict=True):
-            try:
-                with _BoundedFile(path) as file:
-                    read = _read_in_file_order if index.bounds_ns else self._read_in_time_order
-                    for message in read(file, index, topics, start_ns):
-                        if message.log_time_ns >= start_ns:
-                            yield message
-            except OSError as error:  # noqa: PERF203 - once a file
-                raise RecordingError(f"cannot be read: {error.strerror}", where=str(path)) from error
+            with os_errors(RecordingError, "cannot be read", path), _BoundedFile(path) as file:
+                read = _read_in_file_order if index.bounds_ns else self._read_in_time_order
+                for message in read(file, index, topics, start_ns):
+                    if message.log_time_ns >= start_ns:
+                        yield message
 
     def checked_messages(self, types: Mapping[str, str]) -> Iterator[RawMessage]:
         """Yield the messages of topics, {topic: type}, and check their channels; empty: any type.
@@ -390,25 +388,22 @@ _DECOMPRESSORS: dict[str, Callable[[bytes, int], bytes]] = {
 
 
 def _index(path: Path) -> _FileIndex:
-    try:
-        with _BoundedFile(path) as file:
-            magic = file.read(min(file.size, MAGIC_SIZE))
-            if not magic:
-                raise RecordingError("the file is empty", where=str(path), valid="an MCAP file")
-            if magic != MCAP0_MAGIC:
-                raise RecordingError(
-                    f"not an MCAP file: it starts with {magic.hex(' ')}",
-                    where=str(path),
-                    valid="uwb-mitigation data import converts other formats to MCAP",
-                )
-            try:
-                return _summary(file) or _scan(file)
-            except _LIBRARY_ERRORS:
-                index = _scan(file)
-                index.warnings[BAD_INDEX] += index.damage is None
-                return index
-    except OSError as error:
-        raise RecordingError(f"cannot be read: {error.strerror}", where=str(path)) from error
+    with os_errors(RecordingError, "cannot be read", path), _BoundedFile(path) as file:
+        magic = file.read(min(file.size, MAGIC_SIZE))
+        if not magic:
+            raise RecordingError("the file is empty", where=str(path), valid="an MCAP file")
+        if magic != MCAP0_MAGIC:
+            raise RecordingError(
+                f"not an MCAP file: it starts with {magic.hex(' ')}",
+                where=str(path),
+                valid="uwb-mitigation data import converts other formats to MCAP",
+            )
+        try:
+            return _summary(file) or _scan(file)
+        except _LIBRARY_ERRORS:
+            index = _scan(file)
+            index.warnings[BAD_INDEX] += index.damage is None
+            return index
 
 
 def _summary(file: _BoundedFile) -> _FileIndex | None:

@@ -196,7 +196,7 @@ def with_cold_start(candidates: Sequence[Candidate], data: Dataset, universal: B
     With few configurations it is the first candidate, so that it is preferred, otherwise it follows the constant.
     """
     added = list(candidates)
-    if data.preprocessing == universal.preprocessing:
+    if data.preprocessing == universal.card.preprocessing:
         start = partial(_with_offset, float_network(universal))
         place = 0 if has_few_configurations(data) else [item.name for item in added].index(CONSTANT) + 1
         added.insert(place, Candidate(COLD_START, start))

@@ -82,7 +82,7 @@ def quantise_network(
 
 def check(source: Bundle) -> None:
     """Check the arguments of `quantise_bundle` before data is read; raises the same errors."""
-    if source.quantised:
+    if source.card.quantised:
         raise ModelError("already quantised", where=str(source.path), valid="the float bundle it was made of")
     if not source.card.needs_cir:
         raise ModelError(
@@ -101,7 +101,7 @@ def quantise_bundle(source: Bundle, dataset: Dataset, output: Path) -> tuple[Bun
     """
     check(source)
     inputs = calibration_inputs(dataset, seed=0)
-    network = graph.float_weights(source.model, source.architecture)
+    network = graph.float_weights(source.model, source.card.architecture)
     integers = quantise_network(network, inputs)
     difference = np.abs(IntegerNetwork(integers).predict_m(inputs) - floating.predict_m(network, inputs))
     card = replace(source.card, name=output.stem, quantised=True)
