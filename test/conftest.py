@@ -43,6 +43,9 @@ settings.register_profile(
 )
 settings.load_profile("suite")
 
+# With `apt install ccache`, the firmware is compiled once for all workers and runs.
+os.environ["PATH"] = os.pathsep.join(["/usr/lib/ccache", os.environ["PATH"]])
+
 REPOSITORY = Path(__file__).resolve().parent.parent
 
 LONGEST = (

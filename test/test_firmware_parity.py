@@ -20,7 +20,7 @@ from benchmarks.equipment import random_networks
 from uwb_mitigation.errors import MissingDependencyError, UwbMitigationError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.embedded import compiling
-from uwb_mitigation.mitigation.embedded.compiled import CompiledFirmware, FirmwareMitigation, link
+from uwb_mitigation.mitigation.embedded.compiled import CORRECTION, CompiledFirmware, FirmwareMitigation, link
 from uwb_mitigation.mitigation.embedded.compiling import firmware_folder, run_tool
 from uwb_mitigation.mitigation.embedded.export import export_bundle
 from uwb_mitigation.mitigation.model import graph
@@ -72,7 +72,8 @@ def test_overflowing_prediction_is_a_model_error_as_in_the_mitigator(sign: int, 
 
 def build_program(name: str, export: Path, flags: Sequence[str] = ()) -> str:
     """Compile a program of `firmware/test/` with the model in `export`."""
-    return str(link(firmware_folder() / "test" / f"{name}.c", export, export / name, flags))
+    sources = "*.c" if name == "fuzz_link" else CORRECTION
+    return str(link(firmware_folder() / "test" / f"{name}.c", export, export / name, flags, sources))
 
 
 ADDRESS_SANITIZED = ("-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
@@ -185,7 +186,7 @@ def test_mitigator_uses_the_firmware_backend(ros: Ros, tmp_path: Path, monkeypat
 
     bundle = firmware_models.strict_bundle(tmp_path)
     compiler, traces = tmp_path / "cc", tmp_path / "compiled"
-    compiler.write_text(f'#!/bin/sh\ntouch {traces}\nexec {shutil.which("cc")} "$@"\n')
+    compiler.write_text(f'#!/bin/sh\ntouch {traces}\nexec {shutil.which("cc")} "$@" -O0\n')
     compiler.chmod(0o755)
     monkeypatch.setenv("CC", str(compiler))
     measurements = [model_material.measurement(1.0 + seed / 4, seed) for seed in range(20)]
