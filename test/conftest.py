@@ -12,9 +12,11 @@ import fcntl
 import re
 import shutil
 import signal
+import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 import pytest
@@ -42,6 +44,11 @@ settings.register_profile(
     "suite", deadline=None, derandomize=True, database=None, suppress_health_check=[HealthCheck.too_slow]
 )
 settings.load_profile("suite")
+
+# An optimizer of PyTorch imports its compiler, which takes seconds. Here nothing is compiled.
+sys.modules["torch._dynamo"] = no_compiler = ModuleType("torch._dynamo")
+no_compiler.disable = lambda function, *_, **__: function  # type: ignore[attr-defined]
+no_compiler.graph_break = lambda: None  # type: ignore[attr-defined]
 
 # With `apt install ccache`, the firmware is compiled once for all workers and runs.
 os.environ["PATH"] = os.pathsep.join(["/usr/lib/ccache", os.environ["PATH"]])

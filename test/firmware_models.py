@@ -28,6 +28,9 @@ from uwb_mitigation.recordings.decaranging import open_decaranging
 from uwb_mitigation.types.measurement import Cir, Encoding, RangeMeasurement
 
 MODEL_ID = 0x1234ABCD
+BOARD = "uwb_[bcfklnp]*.c"
+"""Sources of a board without the driver of its radio."""
+
 SCALE = ((0.0, 0.25), (32.0, 0.375), (64.0, 1.5), (256.0, 40.0))
 """For the random networks, whose outputs are large."""
 
@@ -103,11 +106,11 @@ def random_measurement(random: np.random.Generator) -> RangeMeasurement:
 
 @functools.cache
 def real_measurements(apartment: Path) -> tuple[RangeMeasurement, ...]:
-    """Return a thousand measurements, the first ones of each log; cached per process."""
+    """Return 420 measurements, the first ones of each log; cached per process."""
     measured: list[RangeMeasurement] = []
     for log in sorted((apartment / "logs").iterdir()):
         with open_decaranging(log) as source:
-            measured += [record.measurement for record in itertools.islice(source, 40)]
+            measured += [record.measurement for record in itertools.islice(source, 15)]
     return tuple(measured)
 
 
@@ -125,6 +128,6 @@ def exported(shape: tuple[int, int, int], folder: Path) -> tuple[Int8Weights, Ne
         weights = random_networks.mlp(samples)
     write_model(folder, weights)
     subject = network_of(weights, None, MODEL_ID, graph.int8_model(weights))
-    count = 500 if shape in PUBLISHED else 200
+    count = 250 if shape in PUBLISHED else 100
     windows = random_networks.rounding_windows(samples, weights.activation_scale["input"], count)
     return weights, subject, windows

@@ -39,7 +39,7 @@ def report(tmp_path: Path) -> Report:
 
     def run(source: str, ports: int = 2, *options: str) -> dict[str, dict]:
         names = ",".join(str(tmp_path / f"{source}{number}") for number in range(ports))
-        command = ["field-report", "--source", source, "--port", names, "--distance", "3.0", "--seconds", "3"]
+        command = ["field-report", "--source", source, "--port", names, "--distance", "3.0", "--seconds", "2"]
         files = ["--force", "-o", str(tmp_path / "out.zip"), "--json", str(tmp_path / "out.json")]
         result = CliRunner().invoke(cli.app, [*command, *files, *(options or ("--no-unplug",))])
         checks = json.loads((tmp_path / "out.json").read_text())["checks"]
@@ -71,7 +71,7 @@ def test_good_uci_boards_pass_and_the_file_names_nobody(
             threading.Thread(target=act).start()
 
         monkeypatch.setattr(field_report, "_ask", replug)
-        checks = report("uci", 2, "--unplug")
+        checks = report("uci", 2, "--unplug", "--seconds", "3")
     assert not failed(checks)
     assert checks["model"]["verdict"] == "warning"
     assert checks["read back: CIR taps"]["value"] == "157"
@@ -160,7 +160,7 @@ def test_silent_board_gives_a_report(report: Report, tmp_path: Path, monkeypatch
     assert {"problem of the driver", "ranges per second", "ids"} <= failed(checks)
     assert "no answer to the reset" in checks["problem of the driver"]["value"]
     page = zipfile.Path(tmp_path / "out.zip", "report.html").read_text()
-    assert re.search(r"\d{4}-\d\d-\d\d \d\d:\d\d UTC; 0 ranges at 3.00 m in 3 s", page)
+    assert re.search(r"\d{4}-\d\d-\d\d \d\d:\d\d UTC; 0 ranges at 3.00 m in 2 s", page)
     with zipfile.ZipFile(tmp_path / "out.zip") as archive:
         for name in archive.namelist():
             assert tmp_path.name.encode() not in archive.read(name)
