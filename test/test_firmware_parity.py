@@ -150,7 +150,7 @@ def test_firmware_equals_the_ranges_of_onnx_runtime(options: dict | None, tmp_pa
     else:
         bundle = firmware_models.strict_bundle(tmp_path, **options)
     random = np.random.default_rng(8)
-    measurements = [firmware_models.random_measurement(random) for _ in range(300)]
+    measurements = [firmware_models.random_measurement(random) for _ in range(600)]
     measurements = [replace(one, tag_id=n % 3, anchor_id=n % 5) for n, one in enumerate(measurements)]
     offsets = Offsets(0.22, {1: 0.1, 2: 0.3}, {1: -0.05, 2: 0.0}, {(2, 3): 2.5})
     firmware, mitigation = FirmwareMitigation(bundle, offsets), Mitigation(bundle, offsets)
