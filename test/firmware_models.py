@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
 import math
 from dataclasses import replace
@@ -24,7 +23,6 @@ from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.mitigation.model.ood import Band, OodBands
 from uwb_mitigation.mitigation.model.weights import Int8Weights
 from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
-from uwb_mitigation.recordings.decaranging import open_decaranging
 from uwb_mitigation.types.measurement import Cir, Encoding, RangeMeasurement
 
 MODEL_ID = 0x1234ABCD
@@ -102,16 +100,6 @@ def random_measurement(random: np.random.Generator) -> RangeMeasurement:
     cir = replace(cir, rx_power_dbm=float(powers[0]), first_path_power_dbm=float(powers[1]))
     range_m = random.choice([3.25, 0.0, -1.0, math.nan, 1e7], p=[0.8, 0.05, 0.05, 0.05, 0.05])
     return RangeMeasurement(1, 2, 3, 4, 5, float(range_m), cir)
-
-
-@functools.cache
-def real_measurements(apartment: Path) -> tuple[RangeMeasurement, ...]:
-    """Return 420 measurements, the first ones of each log; cached per process."""
-    measured: list[RangeMeasurement] = []
-    for log in sorted((apartment / "logs").iterdir()):
-        with open_decaranging(log) as source:
-            measured += [record.measurement for record in itertools.islice(source, 15)]
-    return tuple(measured)
 
 
 PUBLISHED = [*itertools.product((3, 5), published.WINDOWS, (3,)), (0, 157, 0)]
