@@ -58,7 +58,8 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 LONGEST = (
     "site_page self_calibration tracking viewer_page viewer_node calibrate_command tutorial viewer_recordings "
     "robot_estimator firmware_emulator paper_experiment firmware_parity firmware_arduino_build "
-    "robot_localization positioning locator_odometry viewer_playback serial_driver survey_anchors training px4 process"
+    "robot_localization positioning locator_odometry viewer_playback serial_driver survey_anchors training px4 process "
+    "field_report demos frames installed"
 )
 """Files that start first, so that none of them runs alone at the end."""
 
