@@ -8,6 +8,8 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import atexit
+import fcntl
+import re
 import shutil
 import signal
 import tempfile
@@ -18,9 +20,7 @@ from typing import TYPE_CHECKING
 import pytest
 from browser import Browser, chromium
 from drives import HALL
-from fast import SLOW_FIXTURES, is_fast
 from hypothesis import HealthCheck, settings
-from real_logs import import_once
 
 from uwb_mitigation.recordings.mcap import McapRecording
 from uwb_mitigation.types.anchors import dump_anchors
@@ -48,36 +48,30 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 LONGEST = (
     "site_page self_calibration tracking viewer_page viewer_node calibrate_command tutorial viewer_recordings "
     "robot_estimator firmware_emulator paper_experiment firmware_parity firmware_arduino_build "
-    "robot_localization positioning locator_odometry viewer_playback serial_driver survey_anchors training px4 process"
+    "robot_localization positioning locator_odometry viewer_playback serial_driver survey_anchors training px4 process "
+    "field_report demos frames installed"
 )
 """Files that start first, so that none of them runs alone at the end."""
 
 
+SLOW = re.compile(
+    r"rclpy|torch|_msgs\.msg |browser|selenium|compil|command_line|benchmarks\.paper|calibration\.s"
+)
+"""Words in the files that `--fast` leaves out: of ROS, PyTorch, a browser, a compiler, commands, and many drives."""
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption(
-        "--fast", action="store_true", help="only quick tests without ROS and torch, see fast.py"
-    )
+    parser.addoption("--fast", action="store_true", help="only quick tests without ROS and torch")
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    if config.getoption("--fast") and collection_path.match("test_*.py") and not is_fast(collection_path):
-        return True
-    return None
+    is_file = config.getoption("--fast") and collection_path.match("test_*.py")
+    return True if is_file and SLOW.search(collection_path.read_text(encoding="utf-8")) else None
 
 
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     order = {f"test_{name}": place for place, name in enumerate(LONGEST.split())}
     items.sort(key=lambda item: order.get(item.path.stem, len(order)))
-    if not config.getoption("--fast"):
-        return
-    slow = [
-        item
-        for item in items
-        if {mark.name for mark in item.iter_markers()} & {"ros", "slow"}
-        or SLOW_FIXTURES & set(getattr(item, "fixturenames", ()))
-    ]
-    config.hook.pytest_deselected(items=slow)
-    items[:] = [item for item in items if item not in slow]
 
 
 @pytest.fixture(scope="session")
@@ -88,8 +82,10 @@ def browser() -> Iterator[Browser]:
 
 
 @pytest.fixture(scope="session")
-def data() -> Path:
-    """Return the folder of the data sets; skip the test if it is missing."""
+def data(pytestconfig: pytest.Config) -> Path:
+    """Return the folder of the data sets; skip the test if it is missing, or with `--fast`."""
+    if pytestconfig.getoption("--fast"):
+        pytest.skip("reads recordings")
     root = Path(os.environ.get("UWB_MITIGATION_DATA", REPOSITORY.parent / "shared" / "data"))
     if not root.is_dir():
         pytest.skip(f"the data sets are not at {root}: set UWB_MITIGATION_DATA to run this test")
@@ -107,8 +103,21 @@ def apartment(data: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def apartment_imported(apartment: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with the real logs in `apartment.mcap`, which is read faster; see `import_once`."""
-    return import_once(apartment, tmp_path_factory)
+    """Return a folder with `apartment.mcap`, `import.json` and `printed.txt` of `data import`, made once for all workers."""
+    from command_line import succeed  # Quick tests do not need the commands.
+
+    shared = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        shared = shared.parent
+    folder = shared / "apartment_imported"
+    with folder.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (folder / "printed.txt").exists():
+            folder.mkdir(exist_ok=True)
+            options = "-o apartment.mcap --longest-pause inf --json import.json"
+            done = succeed("data", "import", apartment, *options.split(), folder=folder)
+            (folder / "printed.txt").write_text(done.stdout)
+    return folder
 
 
 @pytest.fixture(scope="session")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
 import math
 from dataclasses import replace
@@ -24,10 +23,12 @@ from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.mitigation.model.ood import Band, OodBands
 from uwb_mitigation.mitigation.model.weights import Int8Weights
 from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
-from uwb_mitigation.recordings.decaranging import open_decaranging
 from uwb_mitigation.types.measurement import Cir, Encoding, RangeMeasurement
 
 MODEL_ID = 0x1234ABCD
+BOARD = "uwb_[bcfklnp]*.c"
+"""Sources of a board without the driver of its radio."""
+
 SCALE = ((0.0, 0.25), (32.0, 0.375), (64.0, 1.5), (256.0, 40.0))
 """For the random networks, whose outputs are large."""
 
@@ -101,16 +102,6 @@ def random_measurement(random: np.random.Generator) -> RangeMeasurement:
     return RangeMeasurement(1, 2, 3, 4, 5, float(range_m), cir)
 
 
-@functools.cache
-def real_measurements(apartment: Path) -> tuple[RangeMeasurement, ...]:
-    """Return a thousand measurements, the first ones of each log; cached per process."""
-    measured: list[RangeMeasurement] = []
-    for log in sorted((apartment / "logs").iterdir()):
-        with open_decaranging(log) as source:
-            measured += [record.measurement for record in itertools.islice(source, 40)]
-    return tuple(measured)
-
-
 PUBLISHED = [*itertools.product((3, 5), published.WINDOWS, (3,)), (0, 157, 0)]
 SHAPES = [*PUBLISHED, (3, 9, 1), (3, 12, 2), (3, 23, 3), (3, 40, 2), (3, 81, 3), (3, 156, 1)]
 """First kernel (0: MLP), length and number of modules of each tested network."""
@@ -125,6 +116,6 @@ def exported(shape: tuple[int, int, int], folder: Path) -> tuple[Int8Weights, Ne
         weights = random_networks.mlp(samples)
     write_model(folder, weights)
     subject = network_of(weights, None, MODEL_ID, graph.int8_model(weights))
-    count = 500 if shape in PUBLISHED else 200
+    count = 250 if shape in PUBLISHED else 100
     windows = random_networks.rounding_windows(samples, weights.activation_scale["input"], count)
     return weights, subject, windows

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from bag_material import corrected, record, write_corrected
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import SeekingReader
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
@@ -224,6 +224,7 @@ corrections = st.builds(
 )
 
 
+@settings(max_examples=50)
 @given(measurements, truths, corrections)
 def test_messages_equal_rosbags(
     measurement: RangeMeasurement, truth: Truth, correction: CorrectedRange

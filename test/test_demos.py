@@ -77,7 +77,7 @@ def test_nodes_end_with_their_parent_process(program: str, number: signal.Signal
         while len(nodes := nodes_of(running.pid)) < 2:
             assert running.poll() is None, (tmp_path / "said").read_text()
             assert time.monotonic() < deadline, "it starts no nodes"
-            time.sleep(0.05)
+            time.sleep(0.3)
         running.send_signal(number)
         assert running.wait(TIMEOUT_S) == code, (tmp_path / "said").read_text()
         _, left = psutil.wait_procs(nodes, TIMEOUT_S)

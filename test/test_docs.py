@@ -9,6 +9,7 @@ import importlib.util
 import json
 import re
 import shlex
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -32,7 +33,12 @@ PAGES = sorted(
     for path in REPOSITORY.glob(pattern)
     if not path.is_relative_to(generated.REFERENCE)
 )
-GENERATED = generated.reference()
+
+
+@cache
+def reference_pages() -> frozenset[Path]:
+    """Return the pages that `make docs` generates."""
+    return frozenset(generated.reference())
 
 
 def folder_of(page: Path) -> Path:
@@ -51,7 +57,9 @@ def links(page: Path) -> list[str]:
 def test_links_between_pages_are_valid(page: Path):
     local = [target for target in links(page) if not re.match(r"[a-z]+:", target)]
     targets = {target: (folder_of(page) / target).resolve() for target in local}
-    assert [link for link, path in targets.items() if path not in GENERATED and not path.exists()] == []
+    assert [
+        link for link, path in targets.items() if path not in reference_pages() and not path.exists()
+    ] == []
 
 
 def test_every_page_of_the_documentation_can_be_reached():
@@ -90,6 +98,7 @@ COMMAND = re.compile(
 ALIKE = {f".venv/bin/{node}": ["ros2", "run", "uwb_mitigation", node] for node in NODES}
 
 
+@cache
 def typed(page: Path) -> list[list[str]]:
     """Return the command lines in the code blocks of a page as words, without comments and line continuations."""
     blocks = BLOCK.findall(page.read_text(encoding="utf-8"))

@@ -74,7 +74,9 @@ def library(bundle: Bundle, tmp_path_factory: pytest.TempPathFactory) -> ctypes.
     folder = tmp_path_factory.mktemp("board")
     export_bundle(bundle, folder)
     program = firmware_folder() / "test" / "native_board.c"
-    library = ctypes.CDLL(str(link(program, folder, folder / "board.so", SANITIZED, shared=True)))
+    library = ctypes.CDLL(
+        str(link(program, folder, folder / "board.so", SANITIZED, firmware_models.BOARD, shared=True))
+    )
     size, time, pointer, data = ctypes.c_size_t, ctypes.c_uint64, ctypes.c_void_p, ctypes.c_char_p
     for name, result, *arguments in (
         ("board_new", pointer, ctypes.c_int, ctypes.c_int, size),

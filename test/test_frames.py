@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import itertools
 import math
 from pathlib import Path
@@ -54,6 +55,8 @@ class Buffer:
             stamps = sorted(self.poses.get(source, ()))
             if not stamps or not stamps[0] <= stamp <= stamps[-1]:
                 return None
+            row = bisect.bisect_left(stamps, stamp)
+            stamps = stamps[max(row - 1, 0) : row + 1]
             x, y, yaw = np.array([self.poses[source][at] for at in stamps]).T
             passed = np.array(stamps) - stamp
             x, y, yaw = (np.interp(0.0, passed, values) for values in (x, y, np.unwrap(yaw)))

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import ast
 import os
 import re
 import shlex
@@ -13,7 +12,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
@@ -191,39 +190,47 @@ def test_missing_dependency_is_reported_in_one_line(tmp_path: Path, words: str, 
     assert excerpt in line
 
 
-CORRECT_WITH_THE_FIRMWARE = """
+PLACES = """
 import uwb_mitigation
-from uwb_mitigation.mitigation.embedded.compiled import FirmwareMitigation
 from uwb_mitigation.mitigation.embedded.compiling import firmware_folder
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
+print(uwb_mitigation.__file__, load_bundle(default_model_path()).path, firmware_folder(), sep="\\n")
+"""
+CORRECT_WITH_THE_FIRMWARE = """
+from uwb_mitigation.mitigation.embedded.compiled import FirmwareMitigation
 FirmwareMitigation(load_bundle(default_model_path()))
-print(uwb_mitigation.__file__, default_model_path(), firmware_folder(), sep="\\n")
 """
 
 
 @NEEDS_CC
-@pytest.mark.parametrize("layout", ["lib/python3/site-packages", "."], ids=["prefix", "pip --target"])
-def test_models_and_firmware_backend_need_no_checkout(tmp_path: Path, layout: str):
-    packages = tmp_path / layout
-    steps = ("build", "-b", tmp_path / "build", "build_py", "-d", packages, "install_data", "-d", tmp_path)
+def test_models_and_firmware_backend_need_no_checkout(tmp_path: Path):
+    """In a prefix, and in the folder of `pip --target`, where packages are next to `share`."""
+    prefix, target = tmp_path / "prefix", tmp_path / "target"
+    packages = prefix / "lib/python3/site-packages"
+    steps = ("build", "-b", tmp_path / "build", "build_py", "-d", packages, "install_data", "-d", prefix)
     command = [sys.executable, "setup.py", "-q", *steps]
     subprocess.run(command, cwd=REPOSITORY, check=True, capture_output=True)
-    environment = os.environ | {"PYTHONPATH": str(packages), "AMENT_PREFIX_PATH": ""}
-    command = [sys.executable, "-c", CORRECT_WITH_THE_FIRMWARE]
-    done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert all(Path(place).is_relative_to(tmp_path) for place in done.stdout.split()), done.stdout
+    shutil.copytree(packages, target)
+    shutil.copytree(prefix / "share", target / "share")
+    for folder, path, code in (
+        (prefix, packages, PLACES + CORRECT_WITH_THE_FIRMWARE),
+        (target, target, PLACES),
+    ):
+        environment = os.environ | {"PYTHONPATH": str(path), "AMENT_PREFIX_PATH": ""}
+        command = [sys.executable, "-c", code]
+        done = subprocess.run(
+            command, env=environment, cwd=folder, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        places = done.stdout.split()
+        assert all(Path(place).is_relative_to(folder) for place in places), places
 
 
-def imported(paths: Iterable[Path]) -> Iterator[str]:
+def imported(paths: Iterable[Path]) -> set[str]:
     """Return the top-level packages that files import."""
-    for path in paths:
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Import):
-                yield from (alias.name.partition(".")[0] for alias in node.names)
-            elif isinstance(node, ast.ImportFrom) and node.module:
-                yield node.module.partition(".")[0]
+    texts = (path.read_text(encoding="utf-8") for path in paths)
+    return {name for text in texts for name in re.findall(r"^ *(?:from|import) (\w+)", text, re.MULTILINE)}
 
 
 def test_every_ros_package_that_is_imported_is_declared_and_no_other():
@@ -235,7 +242,7 @@ def test_every_ros_package_that_is_imported_is_declared_and_no_other():
     assert "rclpy" in indexed, "ROS is not set up: run make setup"
     ros = {*indexed, MESSAGES, *NOT_ON_PYPI} - {NAME}
     sources = [*(REPOSITORY / NAME).rglob("*.py"), *(REPOSITORY / "launch").glob("*.py")]
-    used = set(imported(sources)) & ros
+    used = imported(sources) & ros
     assert used == {name for name in declared if not name.startswith(("python-", "python3-"))}
-    tested = set(imported((REPOSITORY / "test").glob("*.py"))) & ros
+    tested = imported((REPOSITORY / "test").glob("*.py")) & ros
     assert tested <= declared | {entry.name for entry in manifest.test_depends}

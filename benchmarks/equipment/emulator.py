@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import itertools
 import re
+import subprocess
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -164,10 +165,7 @@ def count_executed(image: Image, window: NDArray[np.float32]) -> Counter[tuple[i
     This is slow, because the emulator writes a line for each instruction.
     """
     require_tools()
-    folder = image.elf.parent
-    _write_input(folder, _WINDOWS, np.ascontiguousarray(window[None], np.float32))
-    trace = folder / "trace.txt"
-    run_tool([*_command(image), "-singlestep", "-d", "exec,nochain", "-D", str(trace)], folder=folder)
+    _write_input(image.elf.parent, _WINDOWS, np.ascontiguousarray(window[None], np.float32))
     symbols = _symbols(image)
     start = symbols["uwb_network"][0]
     first, last = symbols["run_window"]
@@ -175,8 +173,11 @@ def count_executed(image: Image, window: NDArray[np.float32]) -> Counter[tuple[i
     inside = False
     # Trace 0: 0x7f... [cs_base/pc/flags/cflags] symbol
     pattern = re.compile(r"\[[0-9a-f]+/([0-9a-f]+)/")
-    with trace.open(encoding="ascii", errors="replace") as lines:
-        for line in lines:
+    command = [*_command(image), "-singlestep", "-d", "exec,nochain"]
+    with subprocess.Popen(
+        command, cwd=image.elf.parent, stderr=subprocess.PIPE, text=True, errors="replace"
+    ) as program:
+        for line in program.stderr or ():
             match = pattern.search(line)
             if match is None:
                 continue
@@ -186,7 +187,7 @@ def count_executed(image: Image, window: NDArray[np.float32]) -> Counter[tuple[i
                 break
             if inside:
                 executed.append(address)
-    trace.unlink()
+        program.kill()
     following = [*executed[1:], -1]
     return Counter(
         (address, not 0 < after - address <= 4) for address, after in zip(executed, following, strict=True)

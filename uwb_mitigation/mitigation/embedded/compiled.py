@@ -22,6 +22,9 @@ from uwb_mitigation.types.measurement import CORRECTED, Cir, CirFault, Corrected
 
 _OPTIONS = ("-std=c99", "-O3", "-fPIC", *compiling.WARNINGS)
 
+CORRECTION = "uwb_[cknp]*.c"
+"""Sources that correct ranges: correct, kernels, network, preprocess. The others are for boards."""
+
 _SHIM = (
     '#include "uwb_model.h"\n'
     "const uwb_model *uwb_exported_model(void);\n"
@@ -75,7 +78,7 @@ class CompiledFirmware:
     def __init__(self, export: Path, build: Path, flags: Sequence[str] = ()) -> None:
         shim = build / "exported_model.c"
         shim.write_text(_SHIM, encoding="utf-8")
-        path = link(shim, export, build / "libuwb_mitigation.so", flags, shared=True)
+        path = link(shim, export, build / "libuwb_mitigation.so", flags, CORRECTION, shared=True)
         self._library = compiling.declare(ctypes.CDLL(str(path)), "uwb_", _SIGNATURES)
         self._model = self._library.uwb_exported_model()
         self._arena_bytes: int = self._library.uwb_arena_size(self._model)
@@ -108,10 +111,16 @@ class CompiledFirmware:
 
 
 def link(
-    program: Path, export: Path, output: Path, flags: Sequence[str] = (), *, shared: bool = False
+    program: Path,
+    export: Path,
+    output: Path,
+    flags: Sequence[str] = (),
+    sources: str = "*.c",
+    *,
+    shared: bool = False,
 ) -> Path:
     """Link a C file that includes the model in `export` with the library, for this computer."""
-    objects = library_objects(flags)
+    objects = library_objects(flags, sources)
     options = (*_OPTIONS, *flags, f"-I{compiling.firmware_folder() / 'src'}", f"-I{export}")
     kind = ("-shared",) if shared else ()
     compiling.run_tool(
@@ -120,11 +129,11 @@ def link(
     return output
 
 
-def library_objects(flags: Sequence[str] = ()) -> tuple[str, ...]:
+def library_objects(flags: Sequence[str] = (), sources: str = "*.c") -> tuple[str, ...]:
     """Return the object files of the portable library for this computer, compiled once per process."""
-    sources = compiling.firmware_folder() / "src"
-    options = (*_OPTIONS, *flags, f"-I{sources}")
-    return compiling.compile_objects(compiling.c_compiler(), options, tuple(sorted(sources.glob("*.c"))))
+    folder = compiling.firmware_folder() / "src"
+    options = (*_OPTIONS, *flags, f"-I{folder}")
+    return compiling.compile_objects(compiling.c_compiler(), options, tuple(sorted(folder.glob(sources))))
 
 
 class FirmwareBackend:

@@ -21,6 +21,7 @@ calls `nudge` on its result, so that the ONNX file and the C code contain the sa
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -288,14 +289,13 @@ def nudge(weights: Int8Weights) -> Int8Weights:
     return replace(weights, weight_scale=weight_scale, activation_scale=activation)
 
 
-def _neighbours(value: np.float32) -> list[np.float32]:
-    """Return `value` and its neighbouring float32 values, nearest first."""
-    around = [np.float32(value)]
+def _neighbours(value: np.float32) -> Iterator[np.float32]:
+    """Yield `value` and its neighbouring float32 values, nearest first."""
     up = down = np.float32(value)
+    yield up
     for _ in range(_MAX_ULPS):
         up, down = np.nextafter(up, np.float32(np.inf)), np.nextafter(down, np.float32(0))
-        around += [up, down]
-    return around
+        yield from (up, down)
 
 
 def saturate(values: NDArray[np.int64] | NDArray[np.float32]) -> NDArray[np.uint8]:
