@@ -40,7 +40,7 @@ class Ekf:
         assert not parameters.get("pose0_differential", False)
         assert not parameters.get("pose0_relative", False)
         self._parameters = parameters
-        self._noise = self._diagonal("process_noise_covariance", DEFAULT_NOISE)
+        self._noise = np.diag(self._diagonal("process_noise_covariance", DEFAULT_NOISE))
         self.x, self.P = np.zeros(8), np.diag(self._diagonal("initial_estimate_covariance", [1e-9] * 15))
         self.time_s: float | None = None
 
@@ -57,14 +57,12 @@ class Ekf:
             return
         rows, columns = self._selection(sensor, tuple(values))
         self.predict(time_s)
-        z, R = np.array(list(values.values()))[columns], R[columns][:, columns]
+        z, R = np.array(list(values.values()))[columns], R[np.ix_(columns, columns)]
         # H selects rows of the state.
         covariance = self.P[rows]
         K = np.linalg.solve(covariance[:, rows] + R, covariance).T
         self.x = self.x + K @ (z - self.x[rows])
-        residual = np.eye(8)
-        residual[:, rows] -= K
-        self.P = residual @ self.P @ residual.T + K @ R @ K.T
+        self.P = self.P - K @ covariance
 
     def predict(self, time_s: float) -> None:
         """Predict the state at a time; an earlier one has no effect."""
@@ -84,16 +82,17 @@ class Ekf:
         return [measured[column] for column in columns], columns
 
     def _predict(self, dt: float) -> None:
-        cosine, sine, half = math.cos(self.x[YAW]), math.sin(self.x[YAW]), 0.5 * dt * dt
-        F = np.eye(8)
-        F[X, [VX, VY, AX, AY]] = cosine * dt, -sine * dt, cosine * half, -sine * half
-        F[Y, [VX, VY, AX, AY]] = sine * dt, cosine * dt, sine * half, cosine * half
+        cosine, sine = math.cos(self.x[YAW]) * dt, math.sin(self.x[YAW]) * dt
+        F, half = np.eye(8), 0.5 * dt
+        F[:2, [VX, VY, AX, AY]] = (
+            (cosine, -sine, cosine * half, -sine * half),
+            (sine, cosine, sine * half, cosine * half),
+        )
         F[YAW, VYAW] = F[VX, AX] = F[VY, AY] = dt
-        J = F.copy()
-        moved = F[:2, VX:] @ self.x[VX:]
-        J[X, YAW], J[Y, YAW] = -moved[1], moved[0]
-        self.x = F @ self.x
-        self.P = J @ self.P @ J.T + dt * np.diag(self._noise)
+        before, self.x = self.x, F @ self.x
+        # The Jacobian: the step turns with the yaw.
+        F[X, YAW], F[Y, YAW] = before[Y] - self.x[Y], self.x[X] - before[X]
+        self.P = F @ self.P @ F.T + dt * self._noise
 
     def _diagonal(self, name: str, default: list[float]) -> NDArray[np.float64]:
         values = np.array(self._parameters.get(name, np.diag(default)), np.float64)

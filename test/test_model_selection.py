@@ -57,12 +57,12 @@ def test_simplest_candidate_is_preferred_unless_a_richer_one_gains():
 
 
 def test_line_is_selected_only_for_errors_that_depend_on_power():
-    constant = selection.select_nested(numbered(lambda number: 0.3), candidates.new_models(RECIPE), 3, 0)
+    constant = selection.select_nested(numbered(lambda number: 0.3), candidates.new_models(RECIPE), 2, 0)
     assert constant.chosen == candidates.CONSTANT
     assert constant.mae()[NESTED] < 1e-6
     data = dataset(14, 5, samples=8)
     data = replace(data, error_m=-5.1 - 0.069 * data.rx_power_dbm.astype(float))
-    line = selection.select_nested(data, candidates.new_models(RECIPE), 3, 0)
+    line = selection.select_nested(data, candidates.new_models(RECIPE), 2, 0)
     assert line.chosen == candidates.LINE
     assert line.model.linear_bias.per_rx_power == pytest.approx(-0.069, abs=1e-3)
 

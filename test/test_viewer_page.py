@@ -140,10 +140,12 @@ def test_map_view_is_fixed_until_changed(browser: Browser, view: View, server: V
     assert view_of_map() == zoomed
 
 
-def test_page_can_be_paused_and_resumed(
+def test_page_shows_how_old_it_is_and_can_be_paused_and_resumed(
     browser: Browser, view: View, server: ViewerServer, clock: Clock
 ) -> None:
     open_page(browser, server)
+    with view.scene.lock:
+        browser.wait("its age without updates", lambda: "s behind" in browser.text())
     browser.wait("the state", lambda: "LIVE 0.0 s" in browser.text())
     browser.click("button", "Pause")
     # Wait for the server.
@@ -158,13 +160,6 @@ def test_page_can_be_paused_and_resumed(
     browser.wait("the new range", lambda: browser.column("pairs", "corrected")[0] == pytest.approx(9.5))
     clock.now_s = 12.0
     browser.wait("the age", lambda: "NO RANGES" in browser.text() and "LIVE" not in browser.text())
-
-
-def test_page_without_updates_shows_how_old_it_is(browser: Browser, view: View, server: ViewerServer) -> None:
-    open_page(browser, server)
-    with view.scene.lock:
-        browser.wait("its age", lambda: "s behind" in browser.text())
-    browser.wait("updates", lambda: "LIVE" in browser.text())
 
 
 def test_pair_is_selected_by_click_and_key_during_updates(

@@ -234,15 +234,6 @@ def test_residual_belongs_to_the_anchor_of_its_range():
         assert residuals_m[anchor] == pytest.approx(expected_m, nan_ok=True), "unknown anchor, old position"
 
 
-def test_last_range_before_a_position_is_shown_although_another_pair_begins_later():
-    clock = Clock()
-    whole, scene = Scene(clock, is_whole=True), Scene(clock)
-    for clock.now_s, anchor in ((9.0, 1), (50.0, 2), (60.0, 3), (99.0, 1)):
-        whole.add_sample((anchor, 7), Sample(clock.now_s, 5.0, 5.0, 0.1, Status.OK))
-    scene.show(whole, 50.0)
-    assert (scene.received_s, scene.latest_stamp_s(7)) == (50.0, 50.0)
-
-
 @pytest.mark.parametrize("first", [0, 3], ids=["in order", "overtaken"])
 def test_true_positions_that_overtake_each_other_are_compared_by_their_stamps(first: int):
     scene = Scene(Clock(), is_whole=True)

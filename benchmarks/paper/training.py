@@ -18,7 +18,7 @@ from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.mitigation.model.architecture import HEAD, Architecture, Mlp, Remnet
 from uwb_mitigation.mitigation.model.weights import FloatWeights
 from uwb_mitigation.training.data.dataset import Dataset
-from uwb_mitigation.training.fit.fitting import single_thread
+from uwb_mitigation.training.fit.fitting import Adam, single_thread
 from uwb_mitigation.training.fit.options import FitOptions
 
 ATTENTION_REDUCTION = 8
@@ -157,18 +157,15 @@ class NetworkStack(nn.Module):
             rates = np.full(options.epochs * steps, options.learning_rate)
         losses = []
         with single_thread(options.seed):
-            # The paper's betas and epsilon (section III-B) are torch's defaults; without decay, AdamW is Adam.
-            optimizer = torch.optim.AdamW(self.parameters(), weight_decay=options.weight_decay, fused=True)
+            optimizer = Adam(self.parameters(), options.weight_decay)
             for step, rate in enumerate(rates.tolist()):
                 if step % steps == 0:
                     self.train()
                     order = torch.stack([torch.randperm(len(source)) for _ in range(self.seeds)], 1)
                 rows = order[step % steps * options.batch :][: options.batch]
-                optimizer.param_groups[0]["lr"] = rate
-                optimizer.zero_grad()
                 loss = (self(source[rows]) - targets[rows]).abs().mean(0)
                 loss.sum().backward()
-                optimizer.step()
+                optimizer.step(rate)
                 losses.append(loss.detach().numpy())
                 if step % steps == steps - 1 and not (is_range_test or np.isfinite(losses[-1]).all()):
                     raise DatasetError("the loss diverges", valid="a lower learning rate")
