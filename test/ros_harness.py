@@ -7,6 +7,7 @@ import itertools
 import os
 import signal
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -19,7 +20,6 @@ import rclpy
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from drives import HALL
-from forked_nodes import ENTRY, ForkedNode, can_fork
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.msg import SetParametersResult
@@ -95,14 +95,8 @@ class Process:
     def __init__(self, command: list[str], domain: int, log: Path) -> None:
         self.log = log
         environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "PYTHONUNBUFFERED": "1"}
-        self._popen: subprocess.Popen[bytes] | ForkedNode
-        if can_fork(command, environment):
-            self._popen = ForkedNode(command, environment, log)
-        else:
-            with log.open("wb") as file:
-                self._popen = subprocess.Popen(
-                    command, env=environment, stdout=file, stderr=subprocess.STDOUT
-                )
+        with log.open("wb") as file:
+            self._popen = subprocess.Popen(command, env=environment, stdout=file, stderr=subprocess.STDOUT)
         self.pid = self._popen.pid
 
     def exit_code(self) -> int | None:
@@ -159,7 +153,8 @@ class Ros:
     def start(self, node: str, *parameters: str, arguments: tuple[str, ...] = ()) -> Process:
         """Start a node of this package like its executable."""
         given = [word for parameter in parameters for word in ("-p", parameter)]
-        return self.run([*ENTRY, node, "--ros-args", *given, *arguments])
+        command = [sys.executable, "-m", "uwb_mitigation.commands.entry", node]
+        return self.run([*command, "--ros-args", *given, *arguments])
 
     def run(self, command: list[str]) -> Process:
         process = Process(command, self.domain, self._folder / f"process_{len(self._processes)}.log")
