@@ -14,6 +14,7 @@ from uwb_mitigation.mitigation.model.architecture import HEAD, Remnet
 from uwb_mitigation.mitigation.model.bundle import Session, load_bundle, save_bundle
 from uwb_mitigation.mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.mitigation.model.shipped import SHIPPED, default_model_path, shipped_model_path
+from uwb_mitigation.mitigation.model.weights import inputs_of
 from uwb_mitigation.training.fit.quantisation import quantise_network
 
 
@@ -44,6 +45,24 @@ def test_shipped_network_equals_onnx_runtime():
     assert np.array_equal(session.predict_m(inputs), expected)
     single = np.concatenate([session.predict_m(row[None]) for row in inputs[-500:]])
     assert np.array_equal(single, expected[-500:])
+
+
+def assert_equal_on_all_processors(table: np.ndarray, ratios: list[np.float32]) -> None:
+    """Check a sum in fused, separate and NEON arithmetic on every pair of inputs."""
+    assert np.array_equal(table, requantisation.sum_table(*ratios))
+    assert np.array_equal(table, requantisation.sum_table(*ratios, fused=False))
+    assert np.array_equal(table, requantisation.neon_sum_table(*ratios))
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_every_sum_of_a_shipped_model_is_equal_on_x86_and_arm(name):
+    weights = integer_network(load_bundle(shipped_model_path(name))).weights
+    scale = weights.activation_scale
+    sums = {name: inputs for name, inputs in inputs_of(weights.architecture).items() if len(inputs) == 2}
+    assert len(sums) == 2 * weights.architecture.modules
+    for tensor, operands in sums.items():
+        ratios = [np.float32(scale[operand] / scale[tensor]) for operand in operands]
+        assert_equal_on_all_processors(requantisation.sum_table(*ratios), ratios)
 
 
 SHAPE = Remnet(samples=32)
@@ -128,10 +147,7 @@ def test_nudged_sum_is_equal_in_fused_separate_and_neon_arithmetic_on_every_pair
     total = requantisation.nudge_sum_scale(first, second, np.float32((first + second) * 0.8))
     ratios = [np.float32(first / total), np.float32(second / total)]
 
-    table = requantisation.solve_sum(*ratios).table()
-    assert np.array_equal(table, requantisation.sum_table(*ratios))
-    assert np.array_equal(table, requantisation.sum_table(*ratios, fused=False))
-    assert np.array_equal(table, requantisation.neon_sum_table(*ratios))
+    assert_equal_on_all_processors(requantisation.solve_sum(*ratios).table(), ratios)
 
 
 @pytest.mark.parametrize(
