@@ -30,7 +30,7 @@ from uwb_mitigation.recordings.bag.pose_paths import read_truth
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.recordings.formats import open_recording
 from uwb_mitigation.recordings.mapping.mapped import MappedRecording
-from uwb_mitigation.types.anchors import AnchorMap, anchors_path, dump_anchors, parse_anchors
+from uwb_mitigation.types.anchors import Anchor, AnchorMap, anchors_path, dump_anchors, parse_anchors
 from uwb_mitigation.types.measurement import (
     Cir,
     CorrectedBy,
@@ -257,10 +257,10 @@ def recording_of(ranges: Ranges, truth: TruePath) -> TagRecording:
     return TagRecording(7, ranges, ranges, False, truth)
 
 
-def displaced(ranges: Ranges, truth: TruePath, anchors: AnchorMap = HALL) -> list[int | None]:
+def displaced(ranges: Ranges, truth: TruePath, anchors: AnchorMap = HALL) -> list[Anchor]:
     config = EstimatorConfig(anchors, height=Height(1.0))
     residuals = held_out([track_tag(recording_of(ranges, truth), config)], config)
-    return [row.anchor_id for row in residuals if row.is_displaced]
+    return [row.fitted for row in residuals if row.fitted is not None]
 
 
 def test_anchor_is_accused_only_if_another_position_explains_its_ranges():
@@ -268,7 +268,10 @@ def test_anchor_is_accused_only_if_another_position_explains_its_ranges():
     # The track without anchor 4 fits it worse than anchor 1, which is wrong.
     for row, shift in ((2, (1.5, -1.5, 0.0)), (0, (1.5, 1.5, 0.0))):
         wrong = HALL.position + (np.arange(len(HALL)) == row)[:, None] * shift
-        assert displaced(ranges, truth, HALL.moved(wrong, HALL.sd)) == [row + 1]
+        (fitted,) = displaced(ranges, truth, HALL.moved(wrong, HALL.sd))
+        off_m = np.subtract(fitted.position, HALL.position[row])
+        assert fitted.id == row + 1
+        assert np.abs(off_m).max() < 2.0 * fitted.sd < 0.5
     assert displaced(ranges, truth) == []
     longer = ranges.range_m + 0.8 * (ranges.anchor == 2)
     assert displaced(replace(ranges, range_m=longer), truth) == []

@@ -19,8 +19,9 @@ from uwb_mitigation.calibration.joint_fit import JointFit, Start, fit_joint, obs
 from uwb_mitigation.calibration.motion_segments import GAP_S, Segments
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.config import EstimatorConfig
+from uwb_mitigation.positioning.geometry import unit_vectors
 from uwb_mitigation.positioning.noise_model import MAD_TO_SD, Regressors
-from uwb_mitigation.types.anchors import AnchorMap
+from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Ranges
 
@@ -133,6 +134,16 @@ class AnchorHypotheses:
         gain = misfit.loss - misfit.loss_at(misfit.best)
         return gain if gain > explained_share * misfit.loss else 0.0
 
+    def fitted(self, row: int) -> Anchor:
+        """Return an examined anchor at the position that explains its ranges best, at the height of the file.
+
+        Its standard deviation is that of x and y, for positions of the tag without errors.
+        """
+        misfit = self._misfits[row]
+        return replace(
+            self._anchors.anchors[row], position=tuple(misfit.best.tolist()), sd=misfit.position_sd_m()
+        )
+
     def check(self, reference: str, *, is_independent: bool) -> None:
         """Refuse positions that the ranges contradict.
 
@@ -162,10 +173,9 @@ class AnchorHypotheses:
         ):
             return
         row = suspects[-1]
+        anchor = self._anchors.anchors[row]
         raise DatasetError(
-            f"anchor {self._anchors.anchors[row]} contradicts {reference}: {self._misfits[row].moved_m:.1f} m from its position in the anchors "
-            "file, it explains the ranges",
-            valid=_REMEDY,
+            f"anchor {anchor} contradicts {reference}: {fit_text(anchor, self.fitted(row))}", valid=_REMEDY
         )
 
     def _swap_gain(self, a: int, b: int) -> float:
@@ -232,6 +242,16 @@ class _Misfit:
         of_offsets = 0.5 * float(np.sum((offset_m / LIMITS.offset_sd_m) ** 2))
         return self._weight * float(np.log1p((residual_m / (sd_m or self.sd_m)) ** 2).sum()) + of_offsets
 
+    def position_sd_m(self) -> float:
+        """Return the standard deviation of x and y of `best`, m, from the weighted derivatives of the distances."""
+        unit, _ = unit_vectors(self.antenna, self.best)
+        residual_m, _ = self._residual_m(self.best)
+        weight = self._weight / (1.0 + (residual_m / self.sd_m) ** 2)
+        derivatives = np.concatenate([unit[:, :2], np.ones((len(unit), 1))], axis=1)
+        information = derivatives.T @ (weight[:, None] * derivatives) / self.sd_m**2
+        information[2, 2] += LIMITS.offset_sd_m**-2
+        return float(np.sqrt(np.trace(np.linalg.pinv(information)[:2, :2]) / 2.0))
+
     def refined(self, position: NDArray[np.float64], sd_m: float) -> NDArray[np.float64]:
         """Return the position near `position`, at the same height, that explains the ranges best."""
         start = np.array([[0.0, 0.0], [_SIMPLEX_M, 0.0], [0.0, _SIMPLEX_M]])
@@ -278,6 +298,16 @@ def check_anchors(segments: Segments, fit: JointFit, antenna: NDArray[np.float64
     ranges = replace(segments.ranges, range_m=segments.ranges.range_m - correction_m)
     hypotheses = AnchorHypotheses(fit.config.anchors, ranges, antenna, segments.tag)
     hypotheses.check("the others", is_independent=False)
+
+
+def fit_text(anchor: Anchor, fitted: Anchor) -> str:
+    """Return where an anchor is according to its ranges, for messages."""
+    x, y, _ = fitted.position
+    moved_m = math.dist(anchor.position, fitted.position)
+    return (
+        f"its ranges fit x = {x:.2f} m, y = {y:.2f} m (standard deviation {fitted.sd:.2f} m), {moved_m:.1f} m from its position in "
+        "the anchors file"
+    )
 
 
 def _swapped(anchors: AnchorMap, pair: tuple[int, int], reference: str) -> DatasetError:

@@ -230,6 +230,8 @@ def _show_tracks(tracks: list[TagTracks]) -> None:
 
 
 def _show_residuals(residuals: list[HoldoutErrors], anchors: AnchorMap) -> None:
+    from uwb_mitigation.calibration.hypotheses import fit_text
+
     rows: list[dict[str, Any]] = [
         {
             "anchor": "all"
@@ -251,11 +253,8 @@ def _show_residuals(residuals: list[HoldoutErrors], anchors: AnchorMap) -> None:
         style="dim",
     )
     for row in rows:
-        if row["residual"].is_displaced:
-            warn(
-                f"anchor {row['anchor']}: its ranges fit another position of the anchor. Check its position in the anchors "
-                "file."
-            )
+        if (fitted := row["residual"].fitted) is not None:
+            warn(f"anchor {row['anchor']}: {fit_text(row['anchor'], fitted)}. Measure its position again.")
 
 
 def _show_survey(result: SurveyResult) -> None:

@@ -26,6 +26,7 @@ from uwb_mitigation.viewer.histories import Pair, Trace
 from uwb_mitigation.viewer.recording import (
     POSITIONS,
     RANGES,
+    Displaced,
     Recording,
     Timeline,
     estimate_tracks,
@@ -39,7 +40,7 @@ MAX_STEP_S = 1.0
 MAX_CHECKED = 50_000
 """A check of the anchors tracks once without each of them: a minute for this number of ranges."""
 
-Check = Callable[[Sequence[TagTracks], EstimatorConfig], dict[int, float]]
+Check = Callable[[Sequence[TagTracks], EstimatorConfig], Displaced]
 
 
 class BagPlayer:

@@ -25,7 +25,7 @@ from uwb_mitigation.positioning.recorded_tracks import TagTracks, check_one_tag,
 from uwb_mitigation.recordings.bag.pose_paths import read_truth
 from uwb_mitigation.recordings.bag.reader import BagReader, check_channel
 from uwb_mitigation.recordings.recorded_ranges import KEY, RangeTable, Table, match
-from uwb_mitigation.types.anchors import AnchorMap
+from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.measurement import FAULTS
 from uwb_mitigation.types.ros import schemas, topics
 from uwb_mitigation.types.ros.codec import measurement_key
@@ -49,6 +49,9 @@ BATCH = 64
 """Number of messages that are read ahead to correct their ranges in one call."""
 POSITIONS = frozenset({topics.POSE, topics.ODOMETRY, topics.POSE_SMOOTHED})
 RANGES = frozenset({topics.RANGE_RAW, topics.RANGE_CORRECTED})
+
+Displaced = dict[int, tuple[float, Anchor]]
+"""{anchor whose ranges fit another position: (its median held-out residual, m, the anchor there)}."""
 
 _TRUTH = np.dtype([*KEY, ("true_m", "f8")])
 _POSITION_TOPIC = re.compile(r"(.*)/uwb/(?:(tag_(?:\d+|0x[0-9a-f]+))/)?(pose|odometry|pose_smoothed)")
@@ -190,7 +193,7 @@ class Timeline:
         cirs_ns: {pair: log time of each raw range with a CIR}.
         notices: messages for the page.
         estimates: {tag: its estimated tracks}, if the recording contains no positions.
-        displaced: {anchor whose ranges fit another position: its median held-out residual, m}.
+        displaced: the anchor whose ranges fit another position.
         is_complete: whether tracks, residuals and all incidents have been added.
     """
 
@@ -200,7 +203,7 @@ class Timeline:
     cirs_ns: dict[Pair, list[int]] = field(default_factory=dict)
     notices: list[str] = field(default_factory=list)
     estimates: dict[str, TagTracks] = field(default_factory=dict)
-    displaced: dict[int, float] = field(default_factory=dict)
+    displaced: Displaced = field(default_factory=dict)
     is_complete: bool = False
 
     def __post_init__(self) -> None:

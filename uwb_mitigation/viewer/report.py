@@ -21,6 +21,7 @@ from uwb_mitigation.viewer.figures import HEADINGS, Figures, finish, new_figure
 from uwb_mitigation.viewer.page import TEMPLATES
 from uwb_mitigation.viewer.palette import TRACK_STYLES, TrackKind
 from uwb_mitigation.viewer.playback import BagPlayer
+from uwb_mitigation.viewer.recording import Displaced
 from uwb_mitigation.viewer.state import Controls, PageState, View
 from uwb_mitigation.viewer.texts import ANCHOR_TITLES, TAG_TITLES, Texts
 
@@ -87,7 +88,7 @@ def write_report(
     config: EstimatorConfig,
     backend: Callable[[], Corrector],
     tracks: Sequence[TagTracks],
-    displaced: dict[int, float],
+    displaced: Displaced,
     stamp_offset_s: float = 0.0,
 ) -> None:
     """Write the state of the page at the end of a recording.

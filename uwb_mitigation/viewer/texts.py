@@ -110,7 +110,7 @@ class Texts:
             means |= {
                 "rate": 0.0 if missing else history.rate_hz(scene.stamp_age_s(pair)),
                 "stopped": age_s if missing else 0.0,
-                "displaced": 0.0 if timeline is None else timeline.displaced.get(pair[0], 0.0),
+                "displaced": 0.0 if timeline is None else timeline.displaced.get(pair[0], (0.0,))[0],
             }
             if timeline is not None and timeline.displaced:
                 # A displaced anchor bends the track with which all are compared.

@@ -21,7 +21,7 @@ from uwb_mitigation.positioning.track_settings import TrackSettings
 from uwb_mitigation.recordings.bag.odometry import BASE_LINK, read_imu, read_odometry
 from uwb_mitigation.recordings.bag.pose_paths import read_heights, read_lever_arm, read_range_frame
 from uwb_mitigation.recordings.bag.writer import BagWriter
-from uwb_mitigation.types.anchors import AnchorMap
+from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.ros.poses import (
     BodyTwist,
     encode_odometry,
@@ -93,14 +93,14 @@ class HoldoutErrors:
         anchor_id: None = all anchors.
         ranges: the number of residuals.
         raw_m, corrected_m: of measured and of corrected ranges; corrected NaN if the bag has none.
-        is_displaced: whether another position of the anchor explains the ranges much better.
+        fitted: the anchor at another position that explains the ranges much better; None: there is none.
     """
 
     anchor_id: int | None
     ranges: int
     raw_m: float
     corrected_m: float
-    is_displaced: bool = False
+    fitted: Anchor | None = None
 
 
 def held_out(tracks: Sequence[TagTracks], config: EstimatorConfig) -> list[HoldoutErrors]:
@@ -113,44 +113,37 @@ def held_out(tracks: Sequence[TagTracks], config: EstimatorConfig) -> list[Holdo
     corrected = [(tag.live, tag.recording.ranges) for tag in tracks if tag.recording.corrected]
     rows, of_all = [], (np.zeros(0), np.zeros(0))
     for row, anchor in enumerate(config.anchors.anchors):
-        before, displaced = _residuals(raw, row, config)
-        after, displaced_after = _residuals(corrected, row, config)
-        rows.append(
-            HoldoutErrors(
-                anchor.id,
-                len(before),
-                _median(before),
-                _median(after),
-                displaced_after if corrected else displaced,
-            )
-        )
+        before, fitted = _residuals(raw, row, config)
+        after, fitted_after = _residuals(corrected, row, config)
+        medians_m = _median(before), _median(after)
+        rows.append(HoldoutErrors(anchor.id, len(before), *medians_m, fitted_after if corrected else fitted))
         of_all = np.append(of_all[0], before), np.append(of_all[1], after)
     return [*rows, HoldoutErrors(None, len(of_all[0]), _median(of_all[0]), _median(of_all[1]))]
 
 
-def displaced_anchor(tracks: Sequence[TagTracks], config: EstimatorConfig) -> dict[int, float]:
+def displaced_anchor(tracks: Sequence[TagTracks], config: EstimatorConfig) -> dict[int, tuple[float, Anchor]]:
     """Return `worst_displaced` of the held-out residuals of tracks."""
     return worst_displaced(held_out(tracks, config))
 
 
-def worst_displaced(residuals: Sequence[HoldoutErrors]) -> dict[int, float]:
-    """Return {anchor id: median held-out residual, m} of the anchor whose ranges fit another position; empty: none.
+def worst_displaced(residuals: Sequence[HoldoutErrors]) -> dict[int, tuple[float, Anchor]]:
+    """Return {anchor id: (median held-out residual, m, the anchor at the position that its ranges fit)}; empty: none.
 
     Of several, it is the one with the largest residual: a displaced anchor also bends the tracks without the others.
     """
-    rows = [row for row in residuals if row.is_displaced and row.anchor_id is not None]
-    worst = max(rows, key=lambda row: row.raw_m, default=None)
-    return {} if worst is None or worst.anchor_id is None else {worst.anchor_id: worst.raw_m}
+    displaced = [(row.raw_m, row.fitted) for row in residuals if row.fitted is not None]
+    worst = max(displaced, key=lambda row: row[0], default=None)
+    return {} if worst is None else {worst[1].id: worst}
 
 
 def _residuals(
     recorded: list[tuple[Track, Ranges]], row: int, config: EstimatorConfig
-) -> tuple[NDArray[np.float64], bool]:
+) -> tuple[NDArray[np.float64], Anchor | None]:
     """Return range minus distance of an anchor's ranges, where the track of the others is known.
 
-    Also return whether another position of the anchor explains the ranges of a tag much better.
+    Also return the anchor at another position that explains the ranges of a tag much better, or None.
     """
-    residuals, displaced = [np.zeros(0)], False
+    residuals, fitted = [np.zeros(0)], list[tuple[float, Anchor]]()
     for initial, ranges in recorded:
         mask = ranges.anchor == row
         reference = np.unique(ranges.anchor[~mask])
@@ -161,21 +154,25 @@ def _residuals(
         residual = ranges.range_m[mask] - np.linalg.norm(position - config.anchors.position[row], axis=1)
         residuals.append(residual[np.isfinite(residual)])
         # A displaced anchor also bends the tracks with which the others are judged: an accusation holds without each of them.
-        displaced |= _gain(row, ranges, track, config) > LIMITS.gain and (
+        gain, anchor = _fit(row, ranges, track, config)
+        if gain > LIMITS.gain and (
             len(reference) == MIN_OTHERS
             or all(
-                _gain(row, ranges, _track_without([row, excluded], initial, ranges, config), config)
+                _fit(row, ranges, _track_without([row, excluded], initial, ranges, config), config)[0]
                 > LIMITS.gain / 2.0
                 for excluded in reference.tolist()
             )
-        )
-    return np.concatenate(residuals), displaced
+        ):
+            fitted.append((gain, anchor))
+    return np.concatenate(residuals), max(fitted, key=lambda fit: fit[0], default=(0.0, None))[1]
 
 
-def _gain(row: int, ranges: Ranges, track: Track, config: EstimatorConfig) -> float:
-    """Return the gain in log likelihood of another position of an anchor, for a track that was estimated without it."""
+def _fit(row: int, ranges: Ranges, track: Track, config: EstimatorConfig) -> tuple[float, Anchor]:
+    """Return `gain` and `fitted` of an anchor, for a track that was estimated without it."""
     antenna = TruePath(track.stamp_ns, track.position).position_at(ranges.stamp_ns)
-    return AnchorHypotheses(config.anchors, ranges, antenna).gain(row, is_independent=True)
+    hypotheses = AnchorHypotheses(config.anchors, ranges, antenna)
+    gain = hypotheses.gain(row, is_independent=True)
+    return gain, hypotheses.fitted(row) if gain else config.anchors.anchors[row]
 
 
 def _track_without(rows: list[int], initial: Track, ranges: Ranges, config: EstimatorConfig) -> Track:
