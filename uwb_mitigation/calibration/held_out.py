@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,17 +68,16 @@ class HeldOut:
 
     def merged(self, second_part: HeldOut, is_first: NDArray[np.bool_]) -> HeldOut:
         """Return the errors of this and another part of a recording; `is_first` shows which ranges are of this part, bool (r,)."""
-
-        def joined(first: NDArray[Any], second: NDArray[Any]) -> NDArray[Any]:
-            values = np.empty(len(is_first), first.dtype)
-            values[is_first], values[~is_first] = first, second
-            return values
-
-        residual_m = {
-            name: joined(value, second_part.residual_m[name]) for name, value in self.residual_m.items()
-        }
-        live_m = {name: joined(value, second_part.live_m[name]) for name, value in self.live_m.items()}
-        return HeldOut(joined(self.block, second_part.block), residual_m, live_m, self.is_separate)
+        order = np.argsort(np.argsort(~is_first, kind="stable"))
+        residual_m, live_m = (
+            {name: np.append(value, second[name])[order] for name, value in first.items()}
+            for first, second in (
+                (self.residual_m, second_part.residual_m),
+                (self.live_m, second_part.live_m),
+            )
+        )
+        block = np.append(self.block, second_part.block)[order]
+        return HeldOut(block, residual_m, live_m, self.is_separate)
 
     def mae_m(self, name: str) -> float:
         """Return the mean absolute range error, m."""

@@ -220,11 +220,9 @@ def displacements(position: NDArray[np.float64], guess: NDArray[np.float64]) -> 
     off = position - guess
     for _ in range(30):
         total = weight.sum()
-        a, b = (weight @ position) / total, (weight @ guess) / total
-        p, q = position - a, guess - b
-        cross = weight @ (p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0])
-        along = weight @ (p[:, 0] * q[:, 0] + p[:, 1] * q[:, 1])
-        angle = np.arctan2(cross, along)
+        p, q = position - (weight @ position) / total, guess - (weight @ guess) / total
+        x, y = (weight[:, None] * p[:, :2]).T @ q[:, :2]
+        angle = np.arctan2(x[1] - y[0], x[0] + y[1])
         c, s = np.cos(angle), np.sin(angle)
         turned = p @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
         off = turned - q
