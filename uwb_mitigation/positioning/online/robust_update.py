@@ -91,8 +91,7 @@ class RobustUpdate:
         estimates_errors: whether measurements change offset and errors, which are only considered otherwise.
         consistency: running mean of the second moments of the persisting errors, relative to the model; 1: they are as modelled.
         raw_ratio: the same of raw ranges over a thousand ranges, relative to the model without the factor of `LARGE_RATIO`.
-        overcorrection: running mean of the errors of uncertain corrected ranges, in their published standard deviations; if it is negative,
-            it is subtracted from them.
+        overcorrection: mean error of uncertain corrected ranges in their standard deviations; if negative, it is subtracted.
         residual_square: running mean of the products of two residuals of an anchor in a row, m^2: of their errors without noise.
     """
 
