@@ -115,6 +115,18 @@ def test_constant_errors_of_corrected_ranges_are_estimated():
     assert corrected_rmse < 0.8 * track_errors(without.run(raw).take(last), truth).rmse
 
 
+def test_corrections_that_are_wrong_behind_thin_walls_hardly_change_positions():
+    ranges, truth = drive(seconds=60)
+    is_uncertain = block(replace(ranges, range_m=np.zeros(len(ranges)))).range_m > 0.0
+    variance_m2 = np.where(is_uncertain, 0.2**2, ranges.variance_m2)
+    late, errors = truth.take(truth.stamp_ns > 20 * NANOSECONDS), {}
+    for error_m in (0.0, -0.2):
+        wrong = replace(ranges, range_m=ranges.range_m + error_m * is_uncertain, variance_m2=variance_m2)
+        live = TagEstimator(EstimatorConfig(HALL, height=Height(1.0))).run(wrong)
+        errors[error_m] = track_errors(live, late).rmse
+    assert errors[-0.2] < 1.15 * errors[0.0]
+
+
 def test_large_constant_errors_of_raw_ranges_do_not_make_the_filter_follow_a_few_anchors():
     corners = anchors_at([(x, y, z) for x in (0.0, 12.0) for y in (0.0, 9.0) for z in (0.3, 2.5)])
     ranges, truth = drive(corners, rate_hz=80.0, seed=3)
