@@ -273,7 +273,7 @@ def test_latest_events_of_a_recording_are_shown_and_the_others_counted(bag: Path
     assert shown == [largest, *((100.0 + number, str(number)) for number in range(10, MAX_EVENTS + 10))]
     assert (len(controls.marks["incidents"]), controls.marks["events"]) == (
         MAX_EVENTS + 1,
-        hidden + MAX_EVENTS,
+        hidden + MAX_EVENTS + 1,
     )
 
 

@@ -148,7 +148,7 @@ class Page:
             bad = np.unique((timeline.bad_s / seconds).round(3)).tolist()
             recorded = timeline.scene.incidents
             shares = [time_s / seconds for time_s, _ in recorded.all()]
-            counts = {"faults": timeline.scene.faults, "events": recorded.count}
+            counts = {"faults": timeline.scene.faults, "events": recorded.count + len(recorded.largest_error)}
             self._state.set(marks={"bad": bad, "incidents": shares} | counts)
 
     # Events ---------------------------------------------------------------------------------------------------
