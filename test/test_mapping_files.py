@@ -18,7 +18,7 @@ from pydantic import ValidationError
 from scipy.io import savemat
 from test_mapping import BOOT, MESSAGE, PLAIN, cirs_of, of, ranges_of, read, values_of, with_fields, write
 
-from uwb_mitigation.commands.support.mapped_report import missing
+from uwb_mitigation.commands.support.mapped_report import missing, models_of
 from uwb_mitigation.errors import DamagedRecordingError, MissingDependencyError, RecordingError
 from uwb_mitigation.mitigation.model.choice import CirKind
 from uwb_mitigation.recordings import text_blocks
@@ -517,11 +517,13 @@ def test_models_get_the_radio_of_the_mapping_and_the_report_names_an_assumed_one
     source = of(text, tmp_path / "x.csv", **AMPLITUDES)
     assert str(CirKind.of(next(iter(source)).measurement.cir)).startswith("DW1000 IPATOV (assumed) without")
     assert any(assumed in line for line in missing(source))
-    assert any("universal_amplitude is used" in line for line in missing(source))
+    assert any("universal_amplitude" in line for line in models_of(source))
     for segment in ("IPATOV", "STS"):
         source = of(text, tmp_path / "x.csv", **AMPLITUDES, radio="DW3000", segment=segment)
         assert CirKind.of(next(iter(source)).measurement.cir).source == (RadioType.DW3000, Segment[segment])
         assert not any(assumed in line for line in missing(source))
+        (model,) = models_of(source)
+        assert ("no model in use fits" if segment == "IPATOV" else "dw3000_sts") in model
     with pytest.raises(ValidationError, match="segment: needs radio"):
         of(text, tmp_path / "x.csv", segment="STS")
 

@@ -111,19 +111,22 @@ def test_ranges_that_the_viewer_drops_change_neither_rate_nor_losses() -> None:
     assert history.rate_hz(age_s=2.0) == pytest.approx(10.0)
 
 
-def test_pair_without_ranges_is_silent_only_if_the_viewer_has_dropped_none_of_them(clock: Clock) -> None:
+@pytest.mark.parametrize(("busy_s", "end_s"), [(15, 20), (60, 25)])
+def test_pair_without_ranges_is_silent_later_while_the_viewer_drops_some(
+    busy_s: int, end_s: int, clock: Clock
+) -> None:
     scene = Scene(clock)
-    for number in range(200):
+    for number in range(10 * end_s):
         clock.now_s = number / 10
-        # Anchor 2 stops after 10 s. Until 15 s, the viewer drops nine ranges in ten.
-        if number < 150 and number % 10:
+        # Anchor 2 stops after 10 s. Until `busy_s`, the viewer drops nine ranges in ten.
+        if number < 10 * busy_s and number % 10:
             scene.count_dropped(1)
             continue
         for anchor in (1, 2) if number < 100 else (1,):
             scene.add_sample((anchor, 7), Sample(1000.0 + clock.now_s, 5.3, 5.1, 0.1, Status.OK))
         if number == 150:
             assert {scene.no_data(history) for history in scene.pairs.values()} == {""}
-    assert scene.no_data(scene.pairs[2, 7]) == "no data for 11 s"
+    assert scene.no_data(scene.pairs[2, 7]) == f"no data for {end_s - 9.1:.0f} s"
     assert scene.no_data(scene.pairs[1, 7]) == ""
 
 

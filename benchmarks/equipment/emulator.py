@@ -175,8 +175,14 @@ def count_executed(image: Image, window: NDArray[np.float32]) -> Counter[tuple[i
     pattern = re.compile(r"\[[0-9a-f]+/([0-9a-f]+)/")
     command = [*_command(image), "-singlestep", "-d", "exec,nochain"]
     with subprocess.Popen(
-        command, cwd=image.elf.parent, stderr=subprocess.PIPE, text=True, errors="replace"
+        command,
+        cwd=image.elf.parent,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        errors="replace",
     ) as program:
+        line = ""
         for line in program.stderr or ():
             match = pattern.search(line)
             if match is None:
@@ -188,6 +194,8 @@ def count_executed(image: Image, window: NDArray[np.float32]) -> Counter[tuple[i
             if inside:
                 executed.append(address)
         program.kill()
+    if not executed:
+        raise UwbMitigationError(f"the emulator has executed no inference: {line.strip()}")
     following = [*executed[1:], -1]
     return Counter(
         (address, not 0 < after - address <= 4) for address, after in zip(executed, following, strict=True)

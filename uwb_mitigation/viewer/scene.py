@@ -43,6 +43,8 @@ from uwb_mitigation.viewer.palette import TrackKind
 # Limits. Ids and texts come from the air or the network; above a limit, the oldest entries are removed.
 MAX_PAIRS, MAX_TAGS, MAX_NODES = 256, 64, 64
 MAX_TRACK = 3000  # points
+MAX_DROPPING_S = 10.0
+"""A pair without ranges is silent after this time also if the viewer drops ranges all the time."""
 MAX_OUTAGES = 1000  # of the reading of ranges
 MAX_TEXT = 400  # characters of a name or a message
 MAX_COORDINATE_M = 2e7  # any position on Earth; a position further away is ignored
@@ -198,7 +200,8 @@ class Scene:
     def no_data(self, history: History) -> str:
         """Return "no data for 12 s" for a pair that has stopped, else an empty string."""
         age_s = self.age_s(history)
-        return "" if age_s - history.outage_s(age_s) <= history.max_gap_s else f"no data for {age_s:.0f} s"
+        dropping_s = min(history.outage_s(age_s), MAX_DROPPING_S)
+        return "" if age_s - dropping_s <= history.max_gap_s else f"no data for {age_s:.0f} s"
 
     def history(self, pair: Pair) -> History:
         """Return the history of a pair, a new one for a new pair."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from uwb_mitigation.errors import format_id
 if TYPE_CHECKING:
     from uwb_mitigation.recordings.mapping.mapped import MappedRecording
 
-_ROWS = 5
+_ROWS, _CHECKED = 5, 1000
 _FIELDS = (
     ("range, m", "range", 3),
     ("true range, m", "true range", 3),
@@ -85,7 +86,7 @@ def show_preview(source: MappedRecording) -> None:
         low, middle, high = np.percentile(errors_m, (1, 50, 99))
         text = f"median {middle:+.2f} m, 1 % below {low:+.2f} m, 1 % above {high:+.2f} m"
         print_line(f"Errors (measured - true) of {len(errors_m)} ranges: {text}")
-    for line in missing(source):
+    for line in [*models_of(source), *missing(source)]:
         print_line(line)
 
 
@@ -98,6 +99,17 @@ def _extent(source: MappedRecording) -> str:
     if duration_s > 0:
         text += f" ({counts.min() / duration_s:.2g} to {counts.max() / duration_s:.2g} Hz)"
     return text
+
+
+def models_of(source: MappedRecording) -> list[str]:
+    """Return which shipped model corrects each kind of CIR, or why none does."""
+    from uwb_mitigation.mitigation.model.choice import CirKind, choose_model
+    from uwb_mitigation.mitigation.model.shipped import load_model
+
+    cirs = [record.measurement.cir for record in islice(source, _CHECKED)]
+    kinds = Counter(CirKind.of(cir) for cir in cirs if len(cir))
+    models = load_model() if kinds else ()
+    return [f"{n} of the first {len(cirs)} ranges: {choose_model(models, kind)}" for kind, n in kinds.items()]
 
 
 def missing(source: MappedRecording) -> list[str]:
@@ -114,10 +126,6 @@ def missing(source: MappedRecording) -> list[str]:
             f"{no_cir}: only constants and linear models correct them (networks: status NO_CIR)",
         ),
         (with_cir and unknown("first_path_index"), "no first-path index: networks need it (status BAD_CIR)"),
-        (
-            with_cir and any(map(unknown, ("preamble_count", "rx_power", "first_path_power"))),
-            "no preamble count or levels: the less accurate universal_amplitude is used (docs/background/results.md)",
-        ),
         (
             with_cir and source.is_radio_assumed,
             "no `radio`: models take the CIRs for those of a DW1000's preamble",

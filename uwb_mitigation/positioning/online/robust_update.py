@@ -38,9 +38,10 @@ UNCERTAIN_SD = 0.15
 """Corrected ranges with a larger published standard deviation (m) may be too short: behind thin walls the model corrects obstacles that
 delay nothing, by about this standard deviation. Half of it or more is added again if residuals show it, see `RobustUpdate.overcorrection`."""
 
-MIN_UNCERTAIN, MAX_UNCERTAIN = 15, 4000
-"""The running mean `overcorrection` starts with this number of ranges without an error, and includes at most the latest ones of the
-second number. Chosen on simulated sites 0 to 7 and drives in flats with seeds 101 to 108 and 700 to 703."""
+MIN_UNCERTAIN, MAX_UNCERTAIN = 15, 400
+"""The running mean `overcorrection` starts with this number of ranges without an error, and includes at most about the second number of
+ranges, so that it follows a robot into rooms with other walls. Chosen on simulated sites 0 to 7 and drives in flats with seeds 101 to 108
+and 700 to 703, where 400 to 4,000 are equal."""
 
 MAX_CONSTANT = 16
 """With more anchors, the one whose constant error has been estimated for longest is forgotten: the state remains small."""
