@@ -111,6 +111,16 @@ def test_ranges_that_the_viewer_drops_change_neither_rate_nor_losses() -> None:
     assert history.rate_hz(age_s=2.0) == pytest.approx(10.0)
 
 
+def test_rate_is_that_of_the_latest_known_intervals_while_the_viewer_drops_most() -> None:
+    scene, stamp_s = Scene(), 1000.0
+    for number in range(60):
+        stamp_s += 0.1 if number % 2 else 0.3
+        if number >= 40 and number % 10:
+            scene.count_dropped(1)
+        scene.add_sample((1, 7), Sample(stamp_s, 5.3, 5.1, 0.1, Status.OK))
+    assert scene.pairs[1, 7].rate_hz() == pytest.approx(5.0, abs=0.3)
+
+
 @pytest.mark.parametrize(("busy_s", "end_s"), [(15, 20), (60, 25)])
 def test_pair_without_ranges_is_silent_later_while_the_viewer_drops_some(
     busy_s: int, end_s: int, clock: Clock
