@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from uwb_mitigation.calibration.motion_segments import Segments
@@ -153,13 +154,8 @@ def observations_of(segments: Segments, parameters: Regressors, model: NoiseMode
 
 def medians(values: NDArray[np.float64], index: NDArray[np.intp]) -> NDArray[np.float64]:
     """Return the medians float64 (n, ...) of rows float64 (r, ...) with the same index, int (r,) from 0 to n - 1."""
-    order = np.argsort(index, kind="stable")
-    starts = np.searchsorted(index[order], np.arange(int(index.max(initial=-1)) + 1))
-    result = values[order[starts]]
-    counts = np.diff(np.append(starts, len(index)))
-    for number in np.flatnonzero(counts > 1).tolist():
-        result[number] = np.median(values[order[starts[number] : starts[number] + counts[number]]], axis=0)
-    return result
+    median: NDArray[np.float64] = pd.DataFrame(values).groupby(index).median().to_numpy(np.float64)
+    return median.reshape(-1, *values.shape[1:])
 
 
 def _independent_share(anchor: NDArray[np.intp], seconds: float, persistence_s: float) -> NDArray[np.float64]:
