@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from uwb_mitigation.calibration.motion_segments import Segments
@@ -154,6 +153,9 @@ def observations_of(segments: Segments, parameters: Regressors, model: NoiseMode
 
 def medians(values: NDArray[np.float64], index: NDArray[np.intp]) -> NDArray[np.float64]:
     """Return the medians float64 (n, ...) of rows float64 (r, ...) with the same index, int (r,) from 0 to n - 1."""
+    # Its import takes 0.4 s, and other commands only use other parts of this module.
+    import pandas as pd
+
     median: NDArray[np.float64] = pd.DataFrame(values).groupby(index).median().to_numpy(np.float64)
     return median.reshape(-1, *values.shape[1:])
 
