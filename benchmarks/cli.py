@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -183,8 +184,10 @@ def link(
     from benchmarks.equipment.faults import Faults
 
     faults = Faults(damage, damage, damage)
-    with console.share_bar("sending") as advance:
-        done = loopback(frames, faults, seed=seed, advance=lambda count: advance(count / frames))
+    with console.stage_bars() as on_progress:
+        done = loopback(
+            frames, faults, seed=seed, advance=lambda count: on_progress("sending", count / frames)
+        )
     result = asdict(done) | {"decoder_mb_per_s": done.decoder_mb_per_s}
     _report({key: value for key, value in result.items() if key not in ("bytes_received", "decoder_s")}, json)
 
@@ -255,7 +258,8 @@ def uci(
     recoveries_s = bench.recoveries_s(unplugs)
     result |= {"unplugs": unplugs, "longest_recovery_s": max(recoveries_s)}
     if exchanges:
-        with console.share_bar("exchanges") as advance:
+        with console.stage_bars() as on_progress:
+            advance = partial(on_progress, "exchanges")
             result |= asdict(bench.joins(exchanges, 16, 0.05, 0.01, seed, advance))
             lossy = bench.joins(exchanges // 10, 157, 0.05, 0.0, seed, advance)
         result |= {"lossy_157_taps": asdict(lossy)}

@@ -160,11 +160,10 @@ def measure(
     with tempfile.TemporaryDirectory(prefix="uwb_firmware_") as name:
         folder = Path(name)
         write_header(folder, packed, network.card, network.model_id, golden)
-        optimisation = "-O3" if kernels is Kernels.PORTABLE else "-Os"
-        image = compile_image(folder, folder, Target.QEMU_MPS2, kernels, optimisation)
+        image = compile_image(folder, folder, Target.QEMU_MPS2, kernels)
         result = emulator.run_windows(image, windows)
         cycles = emulator.estimate_cycles(image, emulator.count_executed(image, windows[len(windows) // 2]))
-        flash = emulator.measure_size(folder, folder, kernels, optimisation).flash_bytes
+        flash = emulator.measure_size(folder, folder, kernels).flash_bytes
     published_model = published.MODELS.get((network.network, packed.samples))
     hz = CLOCK_HZ / cycles
     wrong = (result.records["output_m"].view(np.uint32) != expected.view(np.uint32)) | (
@@ -199,9 +198,7 @@ def _correction_instructions(network: Network, golden: Golden, kernels: Kernels)
         with tempfile.TemporaryDirectory(prefix="uwb_firmware_") as name:
             folder = Path(name)
             write_header(folder, network.packed, card, network.model_id, golden)
-            image = compile_image(
-                folder, folder, Target.QEMU_MPS2, kernels, "-O3" if kernels is Kernels.PORTABLE else "-Os"
-            )
+            image = compile_image(folder, folder, Target.QEMU_MPS2, kernels)
             result = emulator.run_measurements(image, measurements, network.packed.samples)
         counts.append(result.instructions_correct)
     return counts[0], counts[0] - counts[1]

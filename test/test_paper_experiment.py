@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,8 @@ from model_material import dataset, integer_network
 
 pytest.importorskip("torch", reason="training is not set up: run make setup-training")
 
+
+import torch
 
 from benchmarks.paper import experiment, report, tables, training
 from benchmarks.paper.data import Parts, shorten_windows
@@ -50,15 +53,20 @@ def finished(tmp_path_factory) -> tuple[Path, ExperimentResults]:
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_stack_is_trained_like_single_networks(shape):
+def test_stack_is_trained_like_single_networks(shape, monkeypatch):
     data = dataset(2, 20, samples=shape.samples)
     # With one batch per epoch, the order has no effect.
     options = replace(QUICK, epochs=30, batch=len(data), dropout=0.0)
     stack = NetworkStack(shape, 2, options.dropout)
-    single = [
-        fitting.fit(shape, data.inputs, data.error_m, options, start=stack.weights_of(seed))
-        for seed in range(2)
-    ]
+    single = []
+    for start in map(stack.weights_of, range(2)):
+        network = fitting.networks.Network(shape, options.dropout)
+        values = chain.from_iterable(zip(start.weight.values(), start.bias.values(), strict=True))
+        for parameter, value in zip(network.parameters(), values, strict=True):
+            parameter.data = torch.from_numpy(value).reshape(parameter.shape)
+        monkeypatch.setattr(fitting.networks, "Network", lambda shape, dropout, network=network: network)
+        single.append(fitting.fit(shape, data.inputs, data.error_m, options))
+        monkeypatch.undo()
     losses = stack.fit(data, options)
     for seed, expected in enumerate(single):
         for name, weight in stack.weights_of(seed).weight.items():

@@ -65,7 +65,7 @@ torch = pytest.importorskip("torch", reason="run `make setup-training`")
 from uwb_mitigation.training import train  # noqa: E402
 from uwb_mitigation.training.fit.candidates import Recipe, fit_new_model  # noqa: E402
 from uwb_mitigation.training.fit.fitting import FitOptions, fit  # noqa: E402
-from uwb_mitigation.training.fit.networks import build_network  # noqa: E402
+from uwb_mitigation.training.fit.networks import Network, weights_of  # noqa: E402
 
 
 def test_seed_gives_the_same_weights():
@@ -146,11 +146,13 @@ def test_card_contains_the_errors_on_held_out_configurations(validation):
     ],
 )
 def test_torch_and_numpy_compute_the_same(shape):
-    weights = random_weights(shape)
-    inputs = windows(20, shape.samples)
+    network, inputs = Network(shape, 0.5).eval(), windows(20, shape.samples)
+    generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
-        computed = build_network(shape, 0.5, weights).eval()(torch.from_numpy(inputs)).numpy()
-    assert np.allclose(floating.predict_m(weights, inputs), computed, atol=1e-5)
+        for parameter in network.parameters():
+            parameter.normal_(0.0, 0.1, generator=generator)
+        computed = network(torch.from_numpy(inputs)).numpy()
+    assert np.allclose(floating.predict_m(weights_of(network), inputs), computed, atol=1e-5)
 
 
 @pytest.mark.parametrize("quantised", [True, False])

@@ -256,13 +256,11 @@ def _run(image: Image, kind: int, rows: NDArray[np.generic], record: np.dtype[np
     )
 
 
-def measure_size(
-    export: Path, build: Path, kernels: Kernels = Kernels.CORTEX_M4, optimisation: str = "-Os"
-) -> Image:
+def measure_size(export: Path, build: Path, kernels: Kernels = Kernels.CORTEX_M4) -> Image:
     """Measure the size of a program that only corrects a range: vectors, start-up, library, model."""
     stub = build / "size.c"
     stub.write_text(_SIZE_STUB, encoding="utf-8")
-    return compile_image(export, build, Target.DWM1001_DEV, kernels, optimisation, stub)
+    return compile_image(export, build, Target.DWM1001_DEV, kernels, stub)
 
 
 def estimate_cycles(image: Image, executed: Counter[tuple[int, bool]]) -> int:

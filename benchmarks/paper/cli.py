@@ -6,6 +6,7 @@ import os
 import shlex
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -129,7 +130,8 @@ def protocol(
             "not a folder", where=str(output), valid="a folder; it is created if it does not exist"
         )
     split_data = _split_data(data, max(lengths))
-    with console.share_bar(f"{len(tasks)} kinds of networks") as update:
+    with console.stage_bars() as on_progress:
+        update = partial(on_progress, f"{len(tasks)} kinds of networks")
         result = experiment.run_experiment(
             split_data, output, tasks, options, trials, workers or os.cpu_count() or 1, update, _command()
         )

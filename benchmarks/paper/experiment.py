@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from benchmarks.paper import published
 from benchmarks.paper.data import Parts
 from benchmarks.paper.results import FORMS, RESULTS, ErrorsByCondition, ExperimentResults, TrainedModel
-from benchmarks.paper.search import search
+from benchmarks.paper.search import multiply_accumulates, search
 from benchmarks.paper.training import NetworkStack, range_test
 from uwb_mitigation.errors import ModelError, ParameterError, UwbMitigationError, check_name
 from uwb_mitigation.files import write_atomically
@@ -108,7 +108,7 @@ def run_experiment(
     """
     longest = data_split.shorten_windows(max(task.samples for task in tasks)).train
     # The most expensive jobs first, so that all processes end at about the same time.
-    ordered = sorted(tasks, key=lambda task: -task.architecture.multiply_accumulates)
+    ordered = sorted(tasks, key=lambda task: -multiply_accumulates(task.architecture))
     jobs: list[tuple[Callable[..., Any], tuple[Any, ...]]] = [
         (train_task, (task, data_split.shorten_windows(task.samples), folder, options)) for task in ordered
     ]

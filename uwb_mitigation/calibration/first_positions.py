@@ -11,11 +11,7 @@ from uwb_mitigation.calibration.joint_fit import KNOT_S
 from uwb_mitigation.calibration.motion_segments import Segments
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.config import EstimatorConfig
-from uwb_mitigation.positioning.online.initialization import (
-    CandidatePosition,
-    candidate_positions,
-    local_optima,
-)
+from uwb_mitigation.positioning.online.initialization import candidate_positions, local_optima
 from uwb_mitigation.positioning.online.tag_estimator import TagEstimator
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Ranges, Track
@@ -51,10 +47,13 @@ def first_positions(
         rows = np.arange(edges[number], edges[number + 1])
         if segments.is_stationary[number]:
             row, value = _medians(segments.ranges, rows, expected_m)
-            possible = _candidate_positions(config, row, value) if len(row) > config.dims else []
-            if possible:
-                position.append(possible[0].position[None])
-                has_position[number] = True
+            if len(row) > config.dims:
+                where, sd = config.anchors.position[row], np.full(len(row), START_SD_M)
+                possible = candidate_positions(
+                    where, value, sd, config.model, height=config.height, area=config.area
+                )
+                position += [best.position[None] for best in possible[:1]]
+                has_position[number] = bool(possible)
             continue
         ranges = segments.ranges.take(rows)
         corrected = replace(ranges, range_m=np.maximum(ranges.range_m - expected_m[rows], 0.0))
@@ -63,13 +62,6 @@ def first_positions(
             position.append(_at_knots(track, ranges))
             has_position[number] = True
     return np.concatenate(position) if position else np.zeros((0, 3)), has_position
-
-
-def _candidate_positions(
-    config: EstimatorConfig, row: NDArray[np.intp], range_m: NDArray[np.float64]
-) -> list[CandidatePosition]:
-    where, sd = config.anchors.position[row], np.full(len(row), START_SD_M)
-    return candidate_positions(where, range_m, sd, config.model, height=config.height, area=config.area)
 
 
 def _at_knots(track: Track, ranges: Ranges) -> NDArray[np.float64]:

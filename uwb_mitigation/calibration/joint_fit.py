@@ -153,13 +153,11 @@ def observations_of(segments: Segments, parameters: Regressors, model: NoiseMode
 
 def medians(values: NDArray[np.float64], index: NDArray[np.intp]) -> NDArray[np.float64]:
     """Return the medians float64 (n, ...) of rows float64 (r, ...) with the same index, int (r,) from 0 to n - 1."""
-    order = np.argsort(index, kind="stable")
-    starts = np.searchsorted(index[order], np.arange(int(index.max(initial=-1)) + 1))
-    result = values[order[starts]]
-    counts = np.diff(np.append(starts, len(index)))
-    for number in np.flatnonzero(counts > 1).tolist():
-        result[number] = np.median(values[order[starts[number] : starts[number] + counts[number]]], axis=0)
-    return result
+    # Its import takes 0.4 s, and other commands only use other parts of this module.
+    import pandas as pd
+
+    median: NDArray[np.float64] = pd.DataFrame(values).groupby(index).median().to_numpy(np.float64)
+    return median.reshape(-1, *values.shape[1:])
 
 
 def _independent_share(anchor: NDArray[np.intp], seconds: float, persistence_s: float) -> NDArray[np.float64]:

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError
@@ -272,11 +273,9 @@ class _AlignmentProblem:
         return best[1]
 
     def medians(self, error: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the median of each pair, of errors (n,)."""
-        median = np.zeros(self.num_pairs)
-        for pair in np.unique(self.pair[np.isfinite(error)]):
-            median[pair] = np.nanmedian(error[self.pair == pair])
-        return median
+        """Return the median of each pair, of errors (n,), NaN: unknown; 0: the pair has none."""
+        median = pd.Series(error).groupby(self.pair).median().reindex(range(self.num_pairs))
+        return np.asarray(median.fillna(0.0), np.float64)
 
     def errors(
         self, time_offset: float, lever: NDArray[np.float64]

@@ -18,7 +18,7 @@ from uwb_mitigation.mitigation.model.bundle import Bundle
 from uwb_mitigation.mitigation.model.choice import CirKind, is_trained_for
 from uwb_mitigation.mitigation.model.floating import float_network, predict_m
 from uwb_mitigation.mitigation.preprocessing import Preprocessing
-from uwb_mitigation.training.data.dataset import CirSources, Dataset
+from uwb_mitigation.training.data.dataset import CirSource, Dataset, source_fields, source_of
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.measurement import RangeMeasurement, Record
 from uwb_mitigation.types.stamps import NS_PER_S
@@ -55,7 +55,7 @@ class SiteData:
         frame_ids: {tag id: the frame ids of its ranges}.
         skipped: {reason: number of excluded ranges}.
         shift_ns: time added to the stamps of each recording, so that recordings do not overlap.
-        sources: radios and segments of the CIRs.
+        sources: radio, segment and channel of the CIRs.
     """
 
     anchors: AnchorMap
@@ -65,7 +65,7 @@ class SiteData:
     frame_ids: dict[int, tuple[str, ...]]
     skipped: Counter[str]
     shift_ns: tuple[int, ...]
-    sources: CirSources
+    sources: set[CirSource]
 
     @property
     def first_rows(self) -> NDArray[np.intp]:
@@ -142,7 +142,7 @@ class SiteData:
             ranges.range_m - true_m - offset_m,
             np.array(names),
             np.full(len(rows), ""),
-            **self.sources.as_fields(),
+            **source_fields(self.sources),
         )
 
 
@@ -199,7 +199,7 @@ class _RangeTable:
         self._anchors, self._universal = anchors, universal
         self._skipped, self._unknown_anchors = Counter[str](), Counter[int]()
         self._rows, self._windows = list[tuple[object, ...]](), list[NDArray[np.float32]]()
-        self._sources, self._frame_ids = CirSources(), dict[int, dict[str, None]]()
+        self._sources, self._frame_ids = set[CirSource](), dict[int, dict[str, None]]()
 
     def add(self, measured: RangeMeasurement, stamp_ns: int, height_m: float | None, recording: int) -> None:
         """Add a range, or count why it is skipped."""
@@ -220,7 +220,7 @@ class _RangeTable:
             columns = measured.tag_id, stamp_ns, row, measured.range_m, height_m, *powers, is_usable, 0.0
             self._rows.append((*columns, recording))
             self._windows.append(window)
-            self._sources.add(cir)
+            self._sources.add(source_of(cir))
 
     def to_site(self, shift_ns: tuple[int, ...]) -> SiteData:
         """Return the ranges by tag and time.

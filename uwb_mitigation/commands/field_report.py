@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from datetime import datetime, timezone
+from functools import partial
 from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -79,8 +80,9 @@ def field_report(
     observation = Observation(distance, seconds)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        with console.share_bar("ranging") as advance:
+        with console.stage_bars() as on_progress:
             capture, unplug_request = folder / "capture.txt", _ask if unplug else None
+            advance = partial(on_progress, "ranging")
             observe(source, ports, mapping, observation, capture, unplug_request, advance, console.warn)
         _correct(observation)
         observation.problem = anonymise(observation.problem, ports)

@@ -49,7 +49,6 @@ class Evb1000Bus:
 
     Attributes:
         version: firmware version that the board reports.
-        repeated: number of requests that were repeated after a damaged or missing answer.
 
     Raises:
         LinkError: the port is absent or in use, or the board is in another mode; the message contains the remedy.
@@ -61,7 +60,6 @@ class Evb1000Bus:
     timeout_us = 60_000
 
     def __init__(self, address: PortAddress) -> None:
-        self.repeated = 0
         self._address = address
         self._fast = False
         self._port: serial.Serial | None = address.open()
@@ -84,7 +82,6 @@ class Evb1000Bus:
         error: LinkError | None = None
         for timeout_s in (ANSWER_TIMEOUT_S, *[REPEATED_TIMEOUT_S] * (MAX_TRIES - 1)):
             if error is not None:
-                self.repeated += 1
                 self._discard_input()
             with self._open_port() as port:
                 if port.timeout != timeout_s:

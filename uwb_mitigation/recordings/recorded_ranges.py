@@ -49,17 +49,13 @@ class Table:
 
 
 def match(rows: NDArray[Any], others: NDArray[Any]) -> NDArray[np.intp]:
-    """Return for each of n rows the index of the row of `others` with the same `KEY`, int (n,); -1: none."""
-    columns = [np.concatenate([rows[name], others[name]]) for name, _ in KEY]
-    order = np.lexsort(columns)
-    is_new = np.zeros(len(order), bool)
-    for column in columns:
-        is_new[1:] |= np.diff(column[order]) != 0
-    group = np.empty(len(order), np.intp)
-    group[order] = np.cumsum(is_new)
-    index = np.full(len(order), -1)
-    index[group[len(rows) :]] = np.arange(len(others))
-    return index[group[: len(rows)]]
+    """Return for each of n rows the index of the row of `others` with the same `KEY`, the last one, int (n,); -1: none."""
+    # Its import takes 0.4 s.
+    import pandas as pd
+
+    left, right = (pd.DataFrame({name: table[name] for name, _ in KEY}) for table in (rows, others))
+    right = right.assign(row=np.arange(len(others))).drop_duplicates(list(left), keep="last")
+    return np.asarray(left.merge(right, "left")["row"].fillna(-1), np.intp)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

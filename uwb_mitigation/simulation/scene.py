@@ -160,11 +160,8 @@ def _incidence_cosine(a: NDArray[np.float64], b: NDArray[np.float64], wall: Wall
 
 
 def _detour(a: NDArray[np.float64], b: NDArray[np.float64], edge: Point) -> NDArray[np.float64]:
-    def between(u: NDArray[np.float64], w: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.hypot(u[..., 0] - w[..., 0], u[..., 1] - w[..., 1])
-
-    corner = np.asarray(edge)
-    return between(a, corner) + between(corner, b) - between(a, b)
+    detour: NDArray[np.float64] = np.hypot(*(a - edge).T) + np.hypot(*(b - edge).T) - np.hypot(*(a - b).T)
+    return detour
 
 
 FLAT = Building(

@@ -198,13 +198,12 @@ def _baselines(
 ) -> Iterator[tuple[str, NDArray[np.floating]]]:
     yield "los_median", baselines.los_median(train_data)(test)
     yield "overall_median", baselines.overall_median(train_data)(test)
+    yield "l1_line", linear_bias_m(candidates.fit_line(train_data), test)
     if not test.has_cirs:
-        yield "l1_line", linear_bias_m(candidates.fit_line(train_data), test)
         return
     yield "ridge", baselines.ridge(train_data, header=False)(test)
     yield "ridge_header", baselines.ridge(train_data, header=True)(test)
     yield "gradient_boosting", baselines.gradient_boosting(train_data, seed)(test)
-    yield "l1_line", linear_bias_m(candidates.fit_line(train_data), test)
     subset = train_data.rows(splits.subsample(train_data.configurations, candidates.PER_CONFIGURATION, seed))
     options, samples = replace(candidates.NETWORK_ONLY, seed=seed), recipe.architecture.samples
     yield "mlp", network_m(fit(Mlp(samples=samples), subset.inputs, subset.error_m, options), test.inputs)

@@ -158,7 +158,7 @@ def _processes(workers: int) -> ProcessPoolExecutor:
     # Forking a process with threads (ONNX Runtime, rich) may deadlock.
     server = "forkserver" in multiprocessing.get_all_start_methods()
     context = multiprocessing.get_context("forkserver" if server else "spawn")
-    return ProcessPoolExecutor(workers, context, initializer=_ignore_interrupts)
+    return ProcessPoolExecutor(workers, context, signal.signal, (signal.SIGINT, signal.SIG_IGN))
 
 
 def _run(
@@ -181,10 +181,6 @@ def _run(
             future.cancel()
 
 
-def _ignore_interrupts() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
 def _in_worker(job: Job) -> Outcome:
     """Process a bag. Ctrl-C, which a terminal sends to all processes, removes its unfinished output."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -195,4 +191,4 @@ def _in_worker(job: Job) -> Outcome:
         partial_file(job.output).unlink(missing_ok=True)
         return Outcome(job, error=RecordingError("interrupted", where=str(job.source)))
     finally:
-        _ignore_interrupts()
+        signal.signal(signal.SIGINT, signal.SIG_IGN)

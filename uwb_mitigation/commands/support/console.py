@@ -142,14 +142,6 @@ def progress() -> Progress:
 
 
 @contextlib.contextmanager
-def share_bar(name: str) -> Iterator[Callable[[float], None]]:
-    """Show a progress bar with remaining time; yield a function that sets the completed fraction."""
-    with progress() as bar:
-        task = bar.add_task(name, total=1.0)
-        yield lambda fraction: bar.update(task, completed=fraction)
-
-
-@contextlib.contextmanager
 def step_bar(name: str, steps: int | None = None) -> Iterator[Callable[[], None]]:
     """Show a progress bar with remaining time if the number of steps is known; yield a function to call after each."""
     with progress() as bar:

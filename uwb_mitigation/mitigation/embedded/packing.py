@@ -6,7 +6,7 @@ The layouts are documented in `firmware/src/uwb_mitigation.h` and `uwb_kernels.h
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +31,6 @@ _BLOCK = 8
 _POSITION_ORDER = [0, 2, 4, 6, 1, 3, 5, 7]
 _POSITION_SHIFT = 21
 _MAX_WEIGHT = 63
-_Integer = TypeVar("_Integer", np.int8, np.int32)
 _REMEDY = "quantise with `requantisation.nudge`, which moves scales by a few ulps"
 
 
@@ -113,8 +112,7 @@ def _packed_convolutions(weights: Int8Weights, shape: Remnet) -> dict[str, Any]:
             raise ModelError("the sum has no exact integer form", where=name, valid=_REMEDY)
         return exact
 
-    first = np.zeros((FILTERS, shape.first_kernel + 1), np.int16)
-    first[:, :-1] = weights.weight["first"][:, 0]
+    first = np.pad(weights.weight["first"][:, 0], ((0, 0), (0, 1))).astype(np.int16)
     modules = []
     tensor = "first"
     for number in range(1, shape.modules + 1):
@@ -165,18 +163,18 @@ def _packed_layers(weights: Int8Weights, shape: Mlp) -> dict[str, Any]:
     layers = []
     for dense in shape.layers:
         outputs, inputs = (-(-size // 8) * 8 for size in (dense.outputs, dense.inputs))
-        padded = np.zeros((outputs, inputs), np.int8)
-        padded[: dense.outputs, : dense.inputs] = weights.weight[dense.name]
+        missing = outputs - dense.outputs
+        padded = np.pad(weights.weight[dense.name], ((0, missing), (0, inputs - dense.inputs)))
         quads = padded.reshape(outputs // 4, 4, inputs // 4, 4).transpose(0, 2, 1, 3)
         layers.append(
             PackedLayer(
                 _share_words(quads.reshape(-1, 2)),
-                Channels(*(_padded(values, outputs) for values in _channels(weights, dense.name))),
+                Channels(*(np.pad(values, (0, missing)) for values in _channels(weights, dense.name))),
                 inputs,
                 outputs,
             )
         )
-    head = _padded(weights.weight[HEAD][:, 0], -(-shape.features // 8) * 8)
+    head = np.pad(weights.weight[HEAD][:, 0], (0, -shape.features % 8))
     return {"head_weights": _head_words(head), "layers": tuple(layers)}
 
 
@@ -230,8 +228,7 @@ def _head_in_blocks(weight: NDArray[np.int8], shape: Remnet) -> NDArray[np.int8]
     """Return the head's weights in the order of the words of the last module, padded with zeros."""
     length = shape.lengths[-1]
     blocks = -(-length // _BLOCK)
-    padded = np.zeros((FILTERS, blocks * _BLOCK), np.int8)
-    padded[:, :length] = weight[:, 0].reshape(FILTERS, length)
+    padded = np.pad(weight[:, 0].reshape(FILTERS, length), ((0, 0), (0, -length % _BLOCK)))
     in_words: NDArray[np.int8] = padded.reshape(FILTERS, blocks, _BLOCK)[..., _POSITION_ORDER].swapaxes(0, 1)
     return in_words
 
@@ -250,9 +247,3 @@ def _head_bias(weight: NDArray[np.int8], bias: NDArray[np.int32]) -> int:
             f"accumulators from {low[0]} to {high[0]}", where=HEAD, valid="magnitudes below 2^23"
         )
     return int(bias[0])
-
-
-def _padded(values: NDArray[_Integer], length: int) -> NDArray[_Integer]:
-    padded = np.zeros(length, values.dtype)
-    padded[: len(values)] = values
-    return padded

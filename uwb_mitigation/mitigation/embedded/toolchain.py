@@ -74,12 +74,11 @@ def compile_image(
     build: Path,
     board: Target,
     kernels: Kernels = Kernels.CORTEX_M4,
-    optimisation: str = "-Os",
     program: Path | None = None,
 ) -> Image:
     """Build the board's program, or another `program`, with the model in `export`, in the folder `build`.
 
-    Arduino builds with `-Os`; the assembly kernels do not depend on the optimisation level.
+    Arduino builds with `-Os`; the assembly kernels do not depend on the optimisation level. Portable ones are built with `-O3`.
 
     Raises:
         MissingDependencyError: a tool is missing, or this is not a source checkout.
@@ -95,8 +94,8 @@ def compile_image(
         )
     common = boards / "cortex_m4"
     elf = build / f"{program.stem if program else board.value}_{kernels.value}.elf"
-    portable = ("-DUWB_PORTABLE",) if kernels is Kernels.PORTABLE else ()
-    options = (*_CPU, *_COMMON, optimisation, *_WARNINGS, *portable, f"-I{library}")
+    kind = ("-O3", "-DUWB_PORTABLE") if kernels is Kernels.PORTABLE else ("-Os",)
+    options = (*_CPU, *_COMMON, *kind, *_WARNINGS, f"-I{library}")
     layers = (*library.glob("*.c"), *(library / "cortex_m4").glob("*.S"), common / "startup.c")
     objects = compile_objects((f"{_PREFIX}gcc",), options, tuple(sorted(layers)))
     sources = [program] if program else sorted((boards / board.value).glob("*.c"))

@@ -56,7 +56,6 @@ class Dense:
     name: str
     inputs: int
     outputs: int
-    output_length = 1
 
     @property
     def weight_shape(self) -> tuple[int, ...]:
@@ -94,12 +93,6 @@ class _Network(ABC):
         """Trainable parameters (paper, Table 1)."""
         biases = sum(layer.weight_shape[0] for layer in self.layers) + 1
         return sum(map(math.prod, self.weight_shapes.values())) + biases
-
-    @property
-    def multiply_accumulates(self) -> int:
-        """Multiply-accumulates of one inference, including padding."""
-        products = (math.prod(layer.weight_shape) * layer.output_length for layer in self.layers)
-        return sum(products) + self.features
 
 
 @dataclass(frozen=True, slots=True)

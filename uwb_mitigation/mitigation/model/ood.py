@@ -44,30 +44,11 @@ def check_float32(name: str, value: float) -> None:
         raise ModelError(f"{name} = {value!r}", valid="a finite float32 value")
 
 
-@dataclass(frozen=True, slots=True)
-class Margins:
-    """Extension of a band beyond the training data, in half widths of the data.
-
-    Attributes:
-        below, above: extension below the lowest and above the highest value.
-        min_half_width: minimum of the half width.
-    """
-
-    below: float
-    above: float
-    min_half_width: float
-
-
 # The model should also work at larger distances, and the error itself increases the range. A signal that is weaker
 # or stronger than distance and the walls of the training data explain, or a first path that is stronger than in LOS,
 # comes from another radio.
-_WIDENINGS = (
-    Margins(1.0, 2.0, 1.0),
-    Margins(0.0, 0.0, 3.0),
-    Margins(0.0, 1.0, 3.0),
-    Margins(1.0, 1.0, 1.5),
-    Margins(1.0, 1.0, 1.5),
-)
+_WIDENINGS = ((1.0, 2.0, 1.0), (0.0, 0.0, 3.0), (0.0, 1.0, 3.0), (1.0, 1.0, 1.5), (1.0, 1.0, 1.5))
+"""The last three arguments of `Band.of`, for each feature except for the lead level."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,11 +66,11 @@ class Band:
             raise ModelError(f"band {astuple(self)}", valid="low <= high, and a positive margin")
 
     @classmethod
-    def of(cls, values: NDArray[np.floating], widening: Margins) -> Band:
-        """Return the extended band of finite values (n,); its margin is half the width of the values."""
+    def of(cls, values: NDArray[np.floating], below: float, above: float, min_half_width: float) -> Band:
+        """Return the band of finite values (n,), extended below and above by multiples of half its width, which is its margin."""
         low, high = float(values.min()), float(values.max())
-        half_width = max((high - low) / 2, widening.min_half_width)
-        bounds = (low - widening.below * half_width, high + widening.above * half_width, half_width)
+        half_width = max((high - low) / 2, min_half_width)
+        bounds = (low - below * half_width, high + above * half_width, half_width)
         return cls(*(float(np.float32(value)) for value in bounds))
 
 
@@ -152,7 +133,7 @@ class OodBands:
         if not has_values.any() or not rows.any():
             raise ModelError("no measurement has all features of the OOD score")
         bands = (
-            Band.of(column, widening) if is_known else None
+            Band.of(column, *widening) if is_known else None
             for column, is_known, widening in zip(
                 values[rows].T[:-1], has_values[:-1], _WIDENINGS, strict=True
             )

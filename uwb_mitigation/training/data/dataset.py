@@ -106,26 +106,20 @@ class Dataset:
         return [str(name) for name in np.unique(self.configurations)]
 
 
-@dataclass(slots=True)
-class CirSources:
-    """Collects the radios, segments and channels of CIRs; unknown radios and segments are those of earlier versions: DW1000, IPATOV."""
+CirSource = tuple[RadioType, Segment, int]
 
-    radios: set[RadioType] = field(default_factory=set)
-    segments: set[Segment] = field(default_factory=set)
-    channels: set[int] = field(default_factory=set)
 
-    def add(self, cir: Cir) -> None:
-        """Add a CIR; without samples it has no segment."""
-        self.radios.add(cir.radio or RadioType.DW1000)
-        self.channels.add(cir.channel)
-        if len(cir):
-            self.segments.add(cir.segment or Segment.IPATOV)
+def source_of(cir: Cir) -> CirSource:
+    """Return radio, segment (0: no samples) and channel; unknown radios and segments are those of earlier versions: DW1000, IPATOV."""
+    segment = (cir.segment or Segment.IPATOV) if len(cir) else Segment.UNKNOWN
+    return cir.radio or RadioType.DW1000, segment, cir.channel
 
-    def as_fields(self) -> dict[str, Any]:
-        """Return the fields of a `Dataset`; no channels if one is unknown."""
-        segments = tuple(sorted(self.segments)) or (Segment.IPATOV,)
-        channels = () if 0 in self.channels else tuple(sorted(self.channels))
-        return {"radios": tuple(sorted(self.radios)), "segments": segments, "channels": channels}
+
+def source_fields(sources: Iterable[CirSource]) -> dict[str, Any]:
+    """Return the fields of a `Dataset` for one source or more; no channels if one is unknown."""
+    radios, segments, channels = (tuple(sorted(set(column))) for column in zip(*sources, strict=True))
+    known = tuple(filter(None, segments)) or (Segment.IPATOV,)
+    return {"radios": radios, "segments": known, "channels": () if 0 in channels else channels}
 
 
 class _Row(NamedTuple):
@@ -178,9 +172,6 @@ def build_dataset(
 
 def _dataset_of(rows: Sequence[_Row], preprocessing: Preprocessing, skipped: Mapping[str, int]) -> Dataset:
     measurements, truths, windows, early_paths = zip(*rows, strict=True)
-    sources = CirSources()
-    for measurement in measurements:
-        sources.add(measurement.cir)
     range_m = np.array([measurement.range_m for measurement in measurements], np.float64)
     cirs = [measurement.cir for measurement in measurements]
     return Dataset(
@@ -197,7 +188,7 @@ def _dataset_of(rows: Sequence[_Row], preprocessing: Preprocessing, skipped: Map
         tags=np.array([measurement.tag_id for measurement in measurements], np.uint64),
         anchors=np.array([measurement.anchor_id for measurement in measurements], np.uint64),
         early_path_m=np.array(early_paths, np.float32),
-        **sources.as_fields(),
+        **source_fields(map(source_of, cirs)),
     )
 
 

@@ -129,9 +129,7 @@ def fit_new_model(
         linear_bias = _constant(data)
     if not recipe.network:
         with fitting.single_thread(seed):
-            return FittedModel(
-                linear_bias, networks.weights_of(networks.build_network(recipe.architecture, 0))
-            )
+            return FittedModel(linear_bias, networks.weights_of(networks.Network(recipe.architecture, 0.0)))
     subset = data.rows(splits.subsample(data.configurations, PER_CONFIGURATION, seed))
     residual = subset.error_m - linear_bias_m(linear_bias, subset)
     # If the linear bias model needs a power that is unknown, the range is passed through.

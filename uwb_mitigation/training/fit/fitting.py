@@ -60,7 +60,6 @@ def fit(
     options: FitOptions,
     on_epoch: Callable[[], None] = lambda: None,
     *,
-    start: FloatWeights | None = None,
     vary: Callable[[Tensor, torch.Generator], Tensor] | None = None,
 ) -> FloatWeights:
     """Fit a network to `targets` by mean absolute error.
@@ -73,7 +72,6 @@ def fit(
         targets: (n,), m.
         options: training options.
         on_epoch: called after each pass over the data.
-        start: initial weights; by default random.
         vary: augments each batch. The learning rate then decreases in `STAGES`, and the result is a running mean of the
             weights, which removes the scatter of the last steps.
 
@@ -87,7 +85,7 @@ def fit(
     with single_thread(options.seed):
         # A separate generator, so that augmentation changes neither the order nor the dropout.
         generator = torch.Generator().manual_seed(options.seed + 77)
-        network = networks.build_network(architecture, options.dropout, start)
+        network = networks.Network(architecture, options.dropout)
         optimizer, rate = Adam(network.parameters(), options.weight_decay), options.learning_rate
         mean = AveragedModel(network, avg_fn=_running_mean)
         # Start from the initial weights.

@@ -42,7 +42,10 @@ class RectifiedLinear(nn.Linear):
 
 
 class Network(nn.Module):
-    """A network: (n, K) to (n,); `dropout`: share of the head's inputs that are dropped."""
+    """A network with random weights: (n, K) to (n,); `dropout`: share of the head's inputs that are dropped.
+
+    Only REMNet has dropout, as in the paper.
+    """
 
     def __init__(self, architecture: Architecture, dropout: float) -> None:
         super().__init__()
@@ -54,7 +57,8 @@ class Network(nn.Module):
             else SameConvolution(layer)
             for layer in architecture.layers
         }
-        self.layers, self.dropout = nn.ModuleDict(layers), nn.Dropout(dropout)
+        self.layers = nn.ModuleDict(layers)
+        self.dropout = nn.Dropout(0.0 if isinstance(architecture, Mlp) else dropout)
         for layer in layers.values():
             if isinstance(layer, RectifiedLinear):
                 nn.init.xavier_uniform_(layer.weight)
@@ -78,28 +82,12 @@ class Network(nn.Module):
         output: Tensor = self.layers[_key(name)](values)
         return output
 
-    def by_name(self) -> dict[str, nn.Module]:
-        """Return {layer: module with its weights and bias}."""
-        layers = {layer.name: self.layers[_key(layer.name)] for layer in self.architecture.layers}
-        return {**layers, HEAD: self.head}
-
-
-def build_network(architecture: Architecture, dropout: float, start: FloatWeights | None = None) -> Network:
-    """Return a network with random weights or with those of `start`. Only REMNet has dropout, as in the paper."""
-    network = Network(architecture, 0.0 if isinstance(architecture, Mlp) else dropout)
-    if start is not None:
-        with torch.no_grad():
-            for name, layer in network.by_name().items():
-                weight = torch.from_numpy(start.weight[name])
-                layer.weight.copy_(weight.T if name == HEAD else weight)
-                layer.bias.copy_(torch.from_numpy(start.bias[name]))
-    return network
-
 
 def weights_of(network: Network) -> FloatWeights:
     """Return a copy of the parameters."""
     weight, bias = {}, {}
-    for name, layer in network.by_name().items():
+    layers = {layer.name: network.layers[_key(layer.name)] for layer in network.architecture.layers}
+    for name, layer in (layers | {HEAD: network.head}).items():
         values = layer.weight.detach().numpy()
         weight[name] = (values.T if name == HEAD else values).copy()
         bias[name] = layer.bias.detach().numpy().copy()

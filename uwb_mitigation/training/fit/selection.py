@@ -38,15 +38,14 @@ class Selection:
         chosen: name of the candidate.
         errors: {candidate, `raw` or NESTED: held-out errors}, m.
         model: the chosen candidate, fitted to all of the data.
-        folds, seed: parameters of the splits. configurations: number of configurations in the data.
+        folds: number of folds. configurations: number of configurations in the data.
     """
 
     chosen: str
     errors: Mapping[str, NDArray[np.float64]]
     model: FittedModel
-    folds: int = 0
-    seed: int = 0
-    configurations: int = 0
+    folds: int
+    configurations: int
 
     def mae(self) -> dict[str, float]:
         """Return {name: MAE of the held-out errors}, m."""
@@ -123,7 +122,7 @@ def select_nested(
         if select_simplest({fallback: errors[fallback], chosen: errors[NESTED]}, min_gain) == fallback:
             chosen = fallback
     (candidate,) = (item for item in candidates if item.name == chosen)
-    return Selection(chosen, errors, candidate.fit(data, seed), folds, seed, len(data.names))
+    return Selection(chosen, errors, candidate.fit(data, seed), folds, len(data.names))
 
 
 def min_configurations(folds: int) -> int:
