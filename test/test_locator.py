@@ -135,6 +135,18 @@ def test_gap_is_bridged_by_predictions_with_growing_covariance(ros: Ros, anchors
     assert spread[-1] > 2 * spread[0]
 
 
+def test_absent_mitigator_and_a_second_locator_are_reported(ros: Ros, anchors: Path):
+    locator = ros.start("locator", f"anchors:={anchors}")
+    remedy = "no ranges: /uwb/range_corrected has no publisher. Start driver and mitigator"
+    ros.diagnosis("locator", lambda status: remedy in status.message)
+    locator.wait_for_output(remedy)
+    run = Drive(ros, seconds=5)
+    run.send(range(100))
+    ros.diagnosis("locator", lambda status: status.message == "locating")
+    ros.node.create_publisher(PoseWithCovarianceStamped, "/uwb/pose", 10)
+    ros.diagnosis("locator", lambda status: "another node publishes /uwb/pose" in status.message)
+
+
 def test_missing_anchors_file_is_reported_by_the_node(ros: Ros, tmp_path: Path):
     excerpt = "no such file"
     locator = ros.start("locator", f"anchors:={tmp_path / 'anchors.yaml'}")

@@ -256,6 +256,11 @@ def test_lever_arm_of_the_parameters_and_yaw_rates_of_an_imu(ros: Ros, anchors: 
     ros.spin_until(lambda: bool(others))
     assert others[-1].pose.pose.position.z == pytest.approx(1.2, abs=0.09)
     assert live.poses[-1].pose.pose.position.z == pytest.approx(1.0, abs=0.09)
+    values = {entry.key: entry.value for entry in ros.diagnosis("locator", lambda _: True).values}
+    assert (values["tag 7 lever arm"], values["tag 9 lever arm"]) == (
+        "0.300,0.100,0.200",
+        "0.000,0.000,0.000",
+    )
 
 
 def test_namespace_contains_the_topics_and_transforms_of_a_robot(ros: Ros, anchors: Path):

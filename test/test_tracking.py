@@ -17,7 +17,7 @@ from drives import HALL, NANOSECONDS, Robot, circuit, drive, wrapped
 from benchmarks.position_data import real_runs, simulated_runs
 from benchmarks.positions import WARM_UP_S, evaluate, locate, odometry_faults
 from uwb_mitigation.commands import positioning
-from uwb_mitigation.commands.offline.track import held_out
+from uwb_mitigation.commands.offline.track import HoldoutErrors, held_out, worst_displaced
 from uwb_mitigation.nodes.support.parameter_tables import TABLES
 from uwb_mitigation.positioning import recorded_tracks as tracking
 from uwb_mitigation.positioning.config import EstimatorConfig, RobotData
@@ -279,6 +279,15 @@ def test_anchor_is_accused_only_if_another_position_explains_its_ranges():
     late = (ranges.anchor == 2) & (ranges.stamp_ns > 30 * NANOSECONDS)
     ranges.range_m[late] += np.random.default_rng(1).exponential(1.5, int(late.sum()))
     assert displaced(ranges, truth) == []
+
+
+@pytest.mark.parametrize(("anchors", "accused", "expected"), [(4, 1, {1}), (4, 2, set()), (5, 2, {2})])
+def test_several_accusations_of_four_anchors_contradict_each_other(
+    anchors: int, accused: int, expected: set[int]
+):
+    fits = [HALL.anchors[row] if row < accused else None for row in range(anchors)]
+    rows = [HoldoutErrors(row + 1, 100, 0.1 * row, 0.0, fit) for row, fit in enumerate(fits)]
+    assert set(worst_displaced([*rows, HoldoutErrors(None, 100, 0.1, 0.1)])) == expected
 
 
 @pytest.mark.parametrize("shift", [(1.0, 0.0, 0.0), (0.0, 0.0, 1.5)])

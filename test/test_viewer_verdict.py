@@ -224,6 +224,29 @@ def test_correction_has_a_figure_only_if_ranges_were_corrected(status: Status):
     assert ("Correction, last 60 s" in shown(scene).cards()) == (status is Status.OK)
 
 
+@pytest.mark.parametrize(
+    ("arm", "heading_rad", "antenna"),
+    [
+        ("0.300,0.000,0.500", math.pi / 2, (1.0, 2.3, 0.5)),
+        ("0.300,0.000,0.500", math.nan, (1.0, 2.0, 0.5)),
+        ("nan,0,0", 0.0, (1.0, 2.0, 0.0)),
+        ("text", 0.0, (1.0, 2.0, 0.0)),
+    ],
+)
+def test_residuals_are_those_of_the_antenna(
+    arm: str, heading_rad: float, antenna: tuple[float, float, float]
+):
+    scene = Scene(Clock())
+    scene.set_anchors([Anchor(1, (4.0, 6.0, 2.5))])
+    entries = [SimpleNamespace(key="tag 7 lever arm", value=arm)]
+    diagnosis = SimpleNamespace(status=[SimpleNamespace(name="locator", level=0, message="", values=entries)])
+    SceneUpdater(scene).add("/diagnostics", diagnosis)
+    scene.add_pose("tag_7", Pose(1.0, 2.0, 0.0, heading_rad=heading_rad, stamp_s=1.0))
+    range_m = math.dist(antenna, (4.0, 6.0, 2.5)) + 0.2
+    scene.add_sample((1, 7), Sample(1.0, range_m, range_m, 0.1, Status.OK))
+    assert scene.pairs[1, 7].columns.residual_m.tolist() == [pytest.approx(0.2)]
+
+
 def test_pairs_tags_and_nodes_without_data_are_marked():
     scene, clock = driven()
     states = ((7, "circle: R"), (8, "unique: R"))

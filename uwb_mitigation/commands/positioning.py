@@ -252,9 +252,13 @@ def _show_residuals(residuals: list[HoldoutErrors], anchors: AnchorMap) -> None:
         "Median absolute residuals. The ranges of each anchor are compared with a track of the other anchors' ranges.",
         style="dim",
     )
-    for row in rows:
-        if (fitted := row["residual"].fitted) is not None:
-            warn(f"anchor {row['anchor']}: {fit_text(row['anchor'], fitted)}. Measure its position again.")
+    accused = [(row["anchor"], row["residual"].fitted) for row in rows if row["residual"].fitted is not None]
+    for anchor, fitted in accused:
+        warn(f"anchor {anchor}: {fit_text(anchor, fitted)}. Measure its position again.")
+    if len(accused) > 1:
+        warn(
+            "One cause is enough for several anchors: one wrong position, or a blocked line of sight, also of an anchor that is not named."
+        )
 
 
 def _show_survey(result: SurveyResult) -> None:

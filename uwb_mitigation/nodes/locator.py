@@ -113,6 +113,7 @@ class Locator(ManagedNode):
         self._outputs: dict[int, _Outputs] = {}
         self._robot: OdometryInput | None = None
         self._lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+        self._ranges_topic = ""
         self._malformed = self._lost = 0
         self._unknown_anchors: set[int] = set()
         self._processing_ns: list[int] = []
@@ -191,10 +192,22 @@ class Locator(ManagedNode):
         if self._robot is not None and (warning := self._robot.warning()):
             warnings.insert(0, warning)
             self.get_logger().warning(warning, throttle_duration_sec=60.0)
+        for outputs in self._outputs.values():
+            if self.count_publishers(outputs.pose.topic_name) > 1:
+                warnings.append(
+                    f"another node publishes {outputs.pose.topic_name}: stop it, or set a namespace"
+                )
+        if not estimator.tags and self._ranges_topic and not self.count_publishers(self._ranges_topic):
+            warnings.append(f"no ranges: {self._ranges_topic} has no publisher. Start driver and mitigator")
         level, text = diagnostics.OK, "locating" if estimator.tags else "no ranges yet"
         if warnings:
+            self.get_logger().warning("; ".join(warnings[:5]), throttle_duration_sec=60.0)
             level, text = diagnostics.WARN, "; ".join(warnings[:5])
         values = estimator.diagnostics() | {"dropped by a queue": self._lost, "malformed": self._malformed}
+        values |= {
+            f"tag {format_id(tag_id)} lever arm": ",".join(f"{m:.3f}" for m in self._lever_arm_of(outputs))
+            for tag_id, outputs in self._outputs.items()
+        }
         values |= self._meter.entries()
         durations_ns, self._processing_ns = self._processing_ns, []
         values |= diagnostics.percentiles("processing", durations_ns)
@@ -212,6 +225,7 @@ class Locator(ManagedNode):
                 return mapping.range_sd
         kind, name = RangeCir if source else RangeCorrected, source or topics.relative(topics.RANGE_CORRECTED)
         self._decode = (lambda data: _uncorrected(decode_range(data))) if source else decode_corrected
+        self._ranges_topic = self.resolve_topic_name(name)
         ranges = endpoints.create_raw_subscription(self, kind, name, self._on_range, self._on_lost)
         self.destroy_at_close(ranges, self.destroy_subscription)
         return 0.0
@@ -361,12 +375,15 @@ class Locator(ManagedNode):
             self._transform_ns[frame] = stamp_ns
             self._tf.publish(self._tf_type(transforms=[transform]))
 
-    def _at_base(self, outputs: _Outputs, estimate: Estimate) -> Estimate:
-        """Return the estimate of the robot's origin. With an unknown heading, a horizontal lever arm may point anywhere."""
+    def _lever_arm_of(self, outputs: _Outputs) -> tuple[float, float, float]:
         if self._robot is not None and outputs.robot is None:
             # The lever arm is that of the robot's tag.
-            return estimate
-        x, y, z = self._lever_arm if outputs.robot is None else outputs.robot.lever_arm
+            return 0.0, 0.0, 0.0
+        return self._lever_arm if outputs.robot is None else outputs.robot.lever_arm
+
+    def _at_base(self, outputs: _Outputs, estimate: Estimate) -> Estimate:
+        """Return the estimate of the robot's origin. With an unknown heading, a horizontal lever arm may point anywhere."""
+        x, y, z = self._lever_arm_of(outputs)
         covariance, heading = estimate.covariance.copy(), estimate.heading
         if heading is None:
             covariance[[0, 1], [0, 1]] += (x * x + y * y) / 2.0

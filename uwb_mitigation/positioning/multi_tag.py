@@ -267,7 +267,8 @@ class MultiTagEstimator:
                     )
                 elif tag.robot.rejects_odometry:
                     warnings.append(
-                        f"{name}: odometry contradicts the ranges (slip, or moved by hand): not used"
+                        f"{name}: odometry contradicts the ranges (slip, moved by hand, or a wrong axis, sign, delay or lever "
+                        "arm): not used"
                     )
             contradicting = [self.anchors.anchors[row] for row in estimator.disagreeing()]
             warnings += [

@@ -5,6 +5,7 @@ Ranges are decoded by this package, all others are message objects; those of rcl
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable
 from functools import partial
@@ -12,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.errors import ParameterError, RecordingError
 from uwb_mitigation.positioning.determination import UNIQUE
-from uwb_mitigation.positioning.geometry import horizontal_ellipse
+from uwb_mitigation.positioning.geometry import horizontal_ellipse, parse_lever_arm
 from uwb_mitigation.recordings.bag.anchor_markers import parse_markers
 from uwb_mitigation.types.measurement import CorrectedRange, RangeMeasurement, Truth
 from uwb_mitigation.types.ros import topics
@@ -28,7 +29,7 @@ from uwb_mitigation.types.ros.codec import (
 from uwb_mitigation.types.stamps import NS_PER_S, to_ns
 from uwb_mitigation.viewer.histories import BoundedDict, Sample, Trace
 from uwb_mitigation.viewer.palette import TrackKind
-from uwb_mitigation.viewer.scene import DEFAULT_TAG, NodeStatus, Pose, Scene
+from uwb_mitigation.viewer.scene import DEFAULT_TAG, MAX_TEXT, NodeStatus, Pose, Scene
 
 MAX_WAITING, MAX_WITHOUT_TRUTH = 10_000, 1000
 """Truths and CIRs without corrected ranges, and corrected ranges without truths, that are kept."""
@@ -38,6 +39,9 @@ DECODERS: dict[str, Callable[[bytes], Any]] = {
     topics.RANGE_TRUTH: decode_truth,
     topics.RANGE_CORRECTED: decode_corrected,
 }
+
+LEVER_ARM = " lever arm"
+"""End of the keys of the lever arms in the diagnostics of the locator."""
 
 MAX_HEADING_VARIANCE = 1.0
 """If the variance of the heading is larger, rad^2, the heading is unknown."""
@@ -141,5 +145,10 @@ class SceneUpdater:
                 for entry in status.values
                 if entry.key.endswith(" determination") and not entry.value.startswith(UNIQUE)
             )
+            for entry in status.values:
+                if entry.key.endswith(LEVER_ARM):
+                    with contextlib.suppress(ParameterError):
+                        arm = parse_lever_arm(str(entry.value)) or (0.0, 0.0, 0.0)
+                        self.scene.lever_arms.add(entry.key.removesuffix(LEVER_ARM)[:MAX_TEXT], arm)
             report = NodeStatus(level, str(status.message), self.scene.clock(), determinations)
             self.scene.set_node_status(str(status.name), report)

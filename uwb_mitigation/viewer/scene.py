@@ -6,6 +6,7 @@ limit.
 
 from __future__ import annotations
 
+import cmath
 import math
 import time
 from bisect import bisect_right
@@ -143,6 +144,7 @@ class Scene:
         pairs: {(anchor, tag): history of its last minute}, the latest at the end.
         tags, anchors, node_statuses: {id or name: ...}.
         tracks: {(name, kind): positions, with the columns of `POSITION`}.
+        lever_arms: {tag: position of its antenna in the frame of its poses, m}.
         reports: (time of reception, name, diagnostics) of a recording.
         latest_stamps: {tag: (its latest stamp, time of its reception)}.
         revision: increases with every change, so that a page draws only changes.
@@ -163,6 +165,7 @@ class Scene:
         self.ranges = self.corrected = self.faults = self.dropped = 0
         self.pairs: BoundedDict[Pair, History] = BoundedDict(math.inf if self.is_whole else MAX_PAIRS)
         self.tags: BoundedDict[str, Pose] = BoundedDict(MAX_TAGS)
+        self.lever_arms: BoundedDict[str, tuple[float, float, float]] = BoundedDict(MAX_TAGS)
         # {tag: (filter of its raw ranges, stamp of the last pose whose height it got)}
         self._raw_locators: BoundedDict[int, tuple[TagEstimator, float]] = BoundedDict(MAX_TAGS)
         self.tracks: BoundedDict[tuple[str, TrackKind], Rows] = BoundedDict(4 * MAX_TAGS)
@@ -333,6 +336,11 @@ class Scene:
         anchor, pose = self.anchors.get(pair[0]), self.tag_of(pair[1])
         if pose is None or anchor is None or self.age_s(pose) > NO_DATA_S:
             return math.nan
+        arm_x, arm_y, arm_z = self.lever_arms.get(f"tag {format_id(pair[1])}", (0.0, 0.0, 0.0))
+        turn = cmath.exp(1j * pose.heading_rad) * complex(arm_x, arm_y)
+        # Without a heading, the locator publishes the horizontal position of the antenna.
+        turn = turn if cmath.isfinite(turn) else 0j
+        pose = replace(pose, x=pose.x + turn.real, y=pose.y + turn.imag, z=pose.z + arm_z)
         self._locate_raw(pair, pose, sample)
         # On a busy computer, positions arrive late.
         if abs(pose.stamp_s - sample.stamp_s) * pose.speed > MAX_MOVED_M:

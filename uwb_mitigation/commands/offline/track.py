@@ -129,11 +129,14 @@ def displaced_anchor(tracks: Sequence[TagTracks], config: EstimatorConfig) -> di
 def worst_displaced(residuals: Sequence[HoldoutErrors]) -> dict[int, tuple[float, Anchor]]:
     """Return {anchor id: (median held-out residual, m, the anchor at the position that its ranges fit)}; empty: none.
 
-    Of several, it is the one with the largest residual: a displaced anchor also bends the tracks without the others.
+    Of several, it is the one with the largest residual: a displaced anchor also bends the tracks without the others. Of four
+    anchors, several accusations contradict each other: blocked ranges of one bend the three tracks without the others.
     """
     displaced = [(row.raw_m, row.fitted) for row in residuals if row.fitted is not None]
-    worst = max(displaced, key=lambda row: row[0], default=None)
-    return {} if worst is None else {worst[1].id: worst}
+    if not displaced or len(residuals) - 1 <= MIN_OTHERS + 1 < MIN_OTHERS + len(displaced):
+        return {}
+    worst = max(displaced, key=lambda row: row[0])
+    return {worst[1].id: worst}
 
 
 def _residuals(
