@@ -25,7 +25,7 @@ radio-demo: setup  ## a tag and four anchors on modelled DW1000s, in the simulat
 	@$(IN_ROS) $(VENV)/bin/python -m benchmarks radio-demo
 
 test-fast: setup-training  ## the quick tests without ROS and torch: a minute on two cores
-	@$(VENV)/bin/python -m pytest -q -n auto --fast -m "not ros and not slow"
+	@$(VENV)/bin/python -m pytest -q -n auto --fast
 
 # More workers than processors: during most of a test, nodes wait for each other. The tests of a file share its fixtures.
 # A failed test is repeated, at most three in a run, and listed as RERUN: it has a race, which is a defect.

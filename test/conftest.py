@@ -55,13 +55,18 @@ LONGEST = (
 
 
 SLOW = re.compile(
-    r"rclpy|torch|_msgs\.msg |browser|selenium|compil|command_line|benchmarks\.paper|calibration\.s"
+    r"rclpy|torch|_msgs\.msg |from browser|selenium|compil|command_line|benchmarks\.paper|calibration\.s"
 )
 """Words in the files that `--fast` leaves out: of ROS, PyTorch, a browser, a compiler, commands, and many drives."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--fast", action="store_true", help="only quick tests without ROS and torch")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if config.getoption("--fast"):
+        config.option.markexpr = "not ros and not slow"
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:

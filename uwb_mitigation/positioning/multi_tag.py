@@ -297,6 +297,8 @@ class MultiTagEstimator:
                 f"{name} innovation mean": f"{estimator.innovation_mean:.2f}",
                 f"{name} innovation square": f"{estimator.innovation_square:.2f}",
             }
+            if range_filter is not None:
+                values[f"{name} overcorrection"] = f"{min(range_filter.state.overcorrection, 0.0):.2f}"
             if tag.robot is not None:
                 values |= {
                     f"{name} heading": tag.robot.heading,
