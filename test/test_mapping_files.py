@@ -23,7 +23,8 @@ from uwb_mitigation.errors import DamagedRecordingError, MissingDependencyError,
 from uwb_mitigation.mitigation.model.choice import CirKind
 from uwb_mitigation.recordings import text_blocks
 from uwb_mitigation.recordings.formats import open_mapped
-from uwb_mitigation.recordings.mapping.mapping import load_mapping
+from uwb_mitigation.recordings.live_ranges import LiveConverter
+from uwb_mitigation.recordings.mapping.mapping import Mapping, load_mapping
 from uwb_mitigation.types.measurement import RadioType, Segment
 
 HEADER = "t,a,r,true\n"
@@ -524,6 +525,10 @@ def test_models_get_the_radio_of_the_mapping_and_the_report_names_an_assumed_one
         assert not any(assumed in line for line in missing(source))
         (model,) = models_of(source)
         assert ("no model in use fits" if segment == "IPATOV" else "dw3000_sts") in model
+    line = {"name": "x", "text": "json", "fields": {"anchor": "a", "range": "r"}, "cir": {"column": "c"}}
+    live = LiveConverter(Mapping.model_validate(line | {"radio": "DW3000", "segment": "STS"}), "lines")
+    (measured,) = live.measurements('{"a": 1, "r": 2.0, "c": [1, 2, 3]}', "port", 1)
+    assert CirKind.of(measured.cir).source == (RadioType.DW3000, Segment.STS)
     with pytest.raises(ValidationError, match="segment: needs radio"):
         of(text, tmp_path / "x.csv", segment="STS")
 
