@@ -18,7 +18,7 @@ from pydantic import ValidationError
 from scipy.io import savemat
 from test_mapping import BOOT, MESSAGE, PLAIN, cirs_of, of, ranges_of, read, values_of, with_fields, write
 
-from uwb_mitigation.commands.support.mapped_report import missing, models_of
+from uwb_mitigation.commands.support.mapped_report import models_of
 from uwb_mitigation.errors import DamagedRecordingError, MissingDependencyError, RecordingError
 from uwb_mitigation.mitigation.model.choice import CirKind
 from uwb_mitigation.recordings import text_blocks
@@ -514,16 +514,17 @@ def test_wide_tables_have_one_row_for_each_pair(tmp_path: Path):
 
 
 def test_models_get_the_radio_of_the_mapping_and_the_report_names_an_assumed_one(tmp_path: Path):
-    text, assumed = with_cir(np.arange(1, 200)), "no `radio`: models take the CIRs for those of a DW1000"
+    text, assumed = with_cir(np.arange(1, 200)), "(assumed: set `radio`)"
     source = of(text, tmp_path / "x.csv", **AMPLITUDES)
     assert str(CirKind.of(next(iter(source)).measurement.cir)).startswith("DW1000 IPATOV (assumed) without")
-    assert any(assumed in line for line in missing(source))
-    assert any("universal_amplitude" in line for line in models_of(source))
+    (text_of_model,) = models_of(source)
+    assert assumed in text_of_model
+    assert "universal_amplitude" in text_of_model
     for segment in ("IPATOV", "STS"):
         source = of(text, tmp_path / "x.csv", **AMPLITUDES, radio="DW3000", segment=segment)
         assert CirKind.of(next(iter(source)).measurement.cir).source == (RadioType.DW3000, Segment[segment])
-        assert not any(assumed in line for line in missing(source))
         (model,) = models_of(source)
+        assert assumed not in model
         assert ("no model in use fits" if segment == "IPATOV" else "dw3000_sts") in model
     line = {"name": "x", "text": "json", "fields": {"anchor": "a", "range": "r"}, "cir": {"column": "c"}}
     live = LiveConverter(Mapping.model_validate(line | {"radio": "DW3000", "segment": "STS"}), "lines")

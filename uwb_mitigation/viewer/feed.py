@@ -140,15 +140,13 @@ class SceneUpdater:
         for status in message.status:
             # An octet is bytes in rclpy and int in rosbags.
             level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
-            determinations = tuple(
-                f"{entry.key}: {entry.value}"
-                for entry in status.values
-                if entry.key.endswith(" determination") and not entry.value.startswith(UNIQUE)
-            )
+            determinations = []
             for entry in status.values:
-                if entry.key.endswith(LEVER_ARM):
+                if entry.key.endswith(" determination") and not entry.value.startswith(UNIQUE):
+                    determinations.append(f"{entry.key}: {entry.value}")
+                elif entry.key.endswith(LEVER_ARM):
                     with contextlib.suppress(ParameterError):
                         arm = parse_lever_arm(str(entry.value)) or (0.0, 0.0, 0.0)
                         self.scene.lever_arms.add(entry.key.removesuffix(LEVER_ARM)[:MAX_TEXT], arm)
-            report = NodeStatus(level, str(status.message), self.scene.clock(), determinations)
+            report = NodeStatus(level, str(status.message), self.scene.clock(), tuple(determinations))
             self.scene.set_node_status(str(status.name), report)

@@ -102,14 +102,17 @@ def _extent(source: MappedRecording) -> str:
 
 
 def models_of(source: MappedRecording) -> list[str]:
-    """Return which shipped model corrects each kind of CIR, or why none does."""
+    """Return which shipped model corrects each kind of CIR, or why none does; assumed: the mapping has no `radio`."""
     from uwb_mitigation.mitigation.model.choice import CirKind, choose_model
     from uwb_mitigation.mitigation.model.shipped import load_model
 
     cirs = [record.measurement.cir for record in islice(source, _CHECKED)]
     kinds = Counter(CirKind.of(cir) for cir in cirs if len(cir))
     models = load_model() if kinds else ()
-    return [f"{n} of the first {len(cirs)} ranges: {choose_model(models, kind)}" for kind, n in kinds.items()]
+    texts = [
+        f"{n} of the first {len(cirs)} ranges: {choose_model(models, kind)}" for kind, n in kinds.items()
+    ]
+    return [text.replace("(assumed)", "(assumed: set `radio`)") for text in texts]
 
 
 def missing(source: MappedRecording) -> list[str]:
@@ -126,10 +129,6 @@ def missing(source: MappedRecording) -> list[str]:
             f"{no_cir}: only constants and linear models correct them (networks: status NO_CIR)",
         ),
         (with_cir and unknown("first_path_index"), "no first-path index: networks need it (status BAD_CIR)"),
-        (
-            with_cir and source.is_radio_assumed,
-            "no `radio`: models take the CIRs for those of a DW1000's preamble",
-        ),
         (unknown("rx_power"), "no receive level: no linear model"),
         (unknown("first_path_power"), "no first-path level: no linear model of the power gap"),
         (not len(source.errors_m), "no true range: `evaluate`, `train` and `offset` cannot use it"),

@@ -132,11 +132,6 @@ class MappedRecording(Source):
         errors: NDArray[np.float64] = self.values["range"] - self.values["true range"]
         return errors[np.isfinite(errors)]
 
-    @property
-    def is_radio_assumed(self) -> bool:
-        """Whether the mapping does not name the radio of the CIRs."""
-        return not self._mapping.radio
-
     def cir(self, row: int) -> Cir:
         """Return the samples of a range."""
         number = int(self.values["cir"][row])
