@@ -162,7 +162,8 @@ def test_anchor_that_is_not_where_the_file_says_is_named_first(bag: Path):
     assert fits == [pytest.approx(HALL.anchors[1].position[:2], abs=0.2)]
     assert np.isfinite(page.column("map", "fit_x")).sum() == 1
     text = next(row[-1] for row in page.controls.health if row[1] == "2")
-    assert f"its ranges fit x = {fits[0][0]:.2f}, y = {fits[0][1]:.2f} m" in text
+    moved_m = math.dist(fits[0], anchors[1].position[:2])
+    assert f"its ranges fit x = {fits[0][0]:.2f}, y = {fits[0][1]:.2f} m, {moved_m:.1f} m away." in text
     states = {row[1]: row[0] for row in page.controls.health}
     assert states.pop("2") == health.BAD
     assert set(states.values()) == {health.UNKNOWN}, "their residuals are relative to a track that it bends"

@@ -186,7 +186,7 @@ def test_better_verdict_is_held_back_and_a_seek_is_not():
         ({"residual": 0.27}, health.BAD, health.BAD),
         ({"residual": 0.13}, health.CHECK, health.CHECK),
         ({"stopped": 5.0}, "", health.BAD),
-        ({"displaced": 0.4, "fit_x": 1.0, "fit_y": 2.0}, "", health.BAD),
+        ({"displaced": 0.4, "fit_x": 1.0, "fit_y": 2.0, "moved": 0.8}, "", health.BAD),
     ],
 )
 def test_state_of_an_anchor_needs_evidence_and_has_hysteresis(

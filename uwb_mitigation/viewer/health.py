@@ -62,13 +62,13 @@ STEPS_M = (0.1, 0.2, 0.5, 1.0, 10.0)
 Means = Mapping[str, float]
 """Means of a pair or an anchor: `rate` (Hz); `nlos`, `lost`, `not_ok` (%); `residual`, corrected range minus distance to
 the estimated position (m); `evidence`, number of residuals; `stopped`, age of the last range if it is not recent, else 0 (s);
-`displaced`, held-out residual (m) of an anchor whose ranges fit another position (`fit_x`, `fit_y`, m), else 0. NaN: unknown."""
+`displaced`, held-out residual (m) of an anchor whose ranges fit another position (`fit_x`, `fit_y`, `moved` from the file, m), else 0. NaN: unknown."""
 
 
 FAULTS = (
     ("stopped", 0.0, BAD, "has not answered for {stopped:.0f} s: check its power and PAN id."),
-    ("displaced", 0.0, BAD, "is not where the anchors file says: its ranges fit x = {fit_x:.2f}, y = {fit_y:.2f} m, and differ by "
-                            "{displaced:.2f} m (median) from a track without them. Measure it again, or run `uwb-mitigation survey`."),
+    ("displaced", 0.0, BAD, "is not where the anchors file says: its ranges fit x = {fit_x:.2f}, y = {fit_y:.2f} m, "
+                            "{moved:.1f} m away. Measure it again, or run `uwb-mitigation survey`."),
     # Without line of sight, ranges may be long although anchor and offset are right.
     ("blocked", LONG_M, CHECK, "reads {size:.2f} m {direction}, with {nlos:.0f} % NLOS: its line of sight is probably blocked. Move it if possible."),
     ("clear", VERY_LONG_M, BAD, "reads {size:.2f} m {direction}: calibrate, or check its position."),

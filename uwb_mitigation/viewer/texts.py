@@ -112,9 +112,11 @@ class Texts:
                 "stopped": age_s if missing else 0.0,
                 "displaced": 0.0,
             }
-            if pair[0] in displaced:
+            if pair[0] in displaced.keys() & scene.anchors.keys():
                 residual_m, place = displaced[pair[0]]
-                means |= {"displaced": residual_m, "fit_x": place.position[0], "fit_y": place.position[1]}
+                x, y = place.position[:2]
+                moved_m = math.dist((x, y), scene.anchors[pair[0]].position[:2])
+                means |= {"displaced": residual_m, "fit_x": x, "fit_y": y, "moved": moved_m}
             if displaced:
                 # A displaced anchor bends the track with which all are compared.
                 means |= {"residual": math.nan, "evidence": 0.0}
