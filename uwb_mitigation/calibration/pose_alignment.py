@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError
@@ -274,6 +273,9 @@ class _AlignmentProblem:
 
     def medians(self, error: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the median of each pair, of errors (n,), NaN: unknown; 0: the pair has none."""
+        # Its import takes 0.4 s.
+        import pandas as pd
+
         median = pd.Series(error).groupby(self.pair).median().reindex(range(self.num_pairs))
         return np.asarray(median.fillna(0.0), np.float64)
 

@@ -436,7 +436,7 @@ class Mapping(TableFormat):
     moving: bool = True
     range_sd: float = Field(default=0.0, ge=0.0)
     radio: Literal["", "DW1000", "DW3000", "QM35"] = ""
-    segment: Literal["IPATOV", "STS"] = "IPATOV"
+    segment: Literal["", "IPATOV", "STS"] = ""
     fields: Fields
     registers: Registers | None = None
     cir: CirSource | None = None
@@ -450,7 +450,7 @@ class Mapping(TableFormat):
             raise ValueError("registers: needs fields.preamble_count")
         if any(source.files and not (source.id and source.position) for source in self.anchors):
             raise ValueError("anchors: id and position are needed with files")
-        if "segment" in self.model_fields_set and not self.radio:
+        if self.segment and not self.radio:
             raise ValueError("segment: needs radio")
         return self
 
@@ -459,7 +459,7 @@ class Mapping(TableFormat):
         """Return the radio and the segment of the CIRs."""
         if not self.radio:
             return RadioType.UNKNOWN, Segment.UNKNOWN
-        return RadioType[self.radio], Segment[self.segment]
+        return RadioType[self.radio], Segment[self.segment or "IPATOV"]
 
     @property
     def values(self) -> dict[str, FieldRule | None]:
