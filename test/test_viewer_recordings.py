@@ -39,7 +39,7 @@ from uwb_mitigation.viewer.incidents import MAX_EVENTS
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.playback import BagPlayer, Check
 from uwb_mitigation.viewer.recording import add_residuals
-from uwb_mitigation.viewer.scene import Scene
+from uwb_mitigation.viewer.scene import Pose, Scene
 from uwb_mitigation.viewer.server import ViewerServer
 from uwb_mitigation.viewer.state import View
 
@@ -233,6 +233,16 @@ def test_residual_belongs_to_the_anchor_of_its_range():
     expected = {9: [6.5 - 4.0, math.nan], 5: [math.nan], 3: [6.5 - 6.0], 11: [math.nan]}
     for anchor, expected_m in expected.items():
         assert residuals_m[anchor] == pytest.approx(expected_m, nan_ok=True), "unknown anchor, old position"
+
+
+def test_residuals_of_recorded_poses_are_those_of_the_antenna():
+    scene = Scene(lambda: 0.0, is_whole=True)
+    scene.add_sample((3, 7), Sample(1.0, 6.5, 6.5, 0.1, Status.OK))
+    for stamp_s in (0.5, 1.5):
+        scene.add_pose("tag_7", Pose(4.0, 0.0, 0.0, heading_rad=math.pi / 2, stamp_s=stamp_s))
+    add_residuals(scene, AnchorMap([Anchor(3, (10.0, 0.0, 0.0))]), {"7": (0.0, -0.3, 0.0)})
+    (residual_m,) = scene.pairs[3, 7].columns.residual_m
+    assert residual_m == pytest.approx(6.5 - 5.7)
 
 
 @pytest.mark.parametrize("first", [0, 3], ids=["in order", "overtaken"])

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 MAX_LEVER_ARM_DIFFERENCE_M = 0.01
 BASE_FRAME = "base_link"
 """The robot's frame if the poses do not name it."""
-
-
 FEW_ANCHORS = 4
 """Three simulated drives past four anchors were accepted although one was 0.8 m off: the track follows it."""
 

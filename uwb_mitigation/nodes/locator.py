@@ -63,6 +63,9 @@ if TYPE_CHECKING:
     from uwb_mitigation.nodes.feeds.topic import TopicFeed
     from uwb_mitigation.recordings.mapping.mapping import Mapping
 
+LOG_AFTER_S = 5.0
+"""Warnings are in the diagnostics, and in the log this time after the activation: other nodes may start later."""
+
 PERIOD_S = 0.2
 """Period of smoothed poses, of markers, and of predictions without ranges."""
 
@@ -113,7 +116,7 @@ class Locator(ManagedNode):
         self._outputs: dict[int, _Outputs] = {}
         self._robot: OdometryInput | None = None
         self._lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
-        self._ranges_topic = ""
+        self._ranges_topic, self._opened_s = "", math.inf
         self._malformed = self._lost = 0
         self._unknown_anchors: set[int] = set()
         self._processing_ns: list[int] = []
@@ -176,6 +179,7 @@ class Locator(ManagedNode):
         self.steady_timer(PERIOD_S, self._on_timer)
 
     def begin(self) -> None:
+        self._opened_s = time.monotonic()
         self._show_anchors()
         self.get_logger().info("locating")
 
@@ -189,9 +193,6 @@ class Locator(ManagedNode):
         if estimator is None:
             return "host", diagnostics.WARN, "no anchors", {}
         warnings = estimator.warnings()
-        if self._robot is not None and (warning := self._robot.warning()):
-            warnings.insert(0, warning)
-            self.get_logger().warning(warning, throttle_duration_sec=60.0)
         for outputs in self._outputs.values():
             if self.count_publishers(outputs.pose.topic_name) > 1:
                 warnings.append(
@@ -199,9 +200,13 @@ class Locator(ManagedNode):
                 )
         if not estimator.tags and self._ranges_topic and not self.count_publishers(self._ranges_topic):
             warnings.append(f"no ranges: {self._ranges_topic} has no publisher. Start driver and mitigator")
+        if warnings and time.monotonic() - self._opened_s > LOG_AFTER_S:
+            self.get_logger().warning("; ".join(warnings[:5]), throttle_duration_sec=60.0)
+        if self._robot is not None and (warning := self._robot.warning()):
+            warnings.insert(0, warning)
+            self.get_logger().warning(warning, throttle_duration_sec=60.0)
         level, text = diagnostics.OK, "locating" if estimator.tags else "no ranges yet"
         if warnings:
-            self.get_logger().warning("; ".join(warnings[:5]), throttle_duration_sec=60.0)
             level, text = diagnostics.WARN, "; ".join(warnings[:5])
         values = estimator.diagnostics() | {"dropped by a queue": self._lost, "malformed": self._malformed}
         values |= {

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import re
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -29,7 +30,7 @@ from uwb_mitigation.types.ros.codec import (
 from uwb_mitigation.types.stamps import NS_PER_S, to_ns
 from uwb_mitigation.viewer.histories import BoundedDict, Sample, Trace
 from uwb_mitigation.viewer.palette import TrackKind
-from uwb_mitigation.viewer.scene import DEFAULT_TAG, MAX_TEXT, NodeStatus, Pose, Scene
+from uwb_mitigation.viewer.scene import DEFAULT_TAG, NodeStatus, Pose, Scene
 
 MAX_WAITING, MAX_WITHOUT_TRUTH = 10_000, 1000
 """Truths and CIRs without corrected ranges, and corrected ranges without truths, that are kept."""
@@ -40,8 +41,8 @@ DECODERS: dict[str, Callable[[bytes], Any]] = {
     topics.RANGE_CORRECTED: decode_corrected,
 }
 
-LEVER_ARM = " lever arm"
-"""End of the keys of the lever arms in the diagnostics of the locator."""
+LEVER_ARM = re.compile(r"tag (\S{1,20}) lever arm")
+"""Key of a lever arm in the diagnostics of the locator."""
 
 MAX_HEADING_VARIANCE = 1.0
 """If the variance of the heading is larger, rad^2, the heading is unknown."""
@@ -144,9 +145,12 @@ class SceneUpdater:
             for entry in status.values:
                 if entry.key.endswith(" determination") and not entry.value.startswith(UNIQUE):
                     determinations.append(f"{entry.key}: {entry.value}")
-                elif entry.key.endswith(LEVER_ARM):
+                elif (match := LEVER_ARM.fullmatch(entry.key)) is not None:
                     with contextlib.suppress(ParameterError):
-                        arm = parse_lever_arm(str(entry.value)) or (0.0, 0.0, 0.0)
-                        self.scene.lever_arms.add(entry.key.removesuffix(LEVER_ARM)[:MAX_TEXT], arm)
+                        arm = parse_lever_arm(str(entry.value))
+                        if arm is not None and any(arm):
+                            self.scene.lever_arms.add(match[1], arm)
+                        else:
+                            self.scene.lever_arms.pop(match[1], None)
             report = NodeStatus(level, str(status.message), self.scene.clock(), tuple(determinations))
             self.scene.set_node_status(str(status.name), report)

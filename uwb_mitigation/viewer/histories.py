@@ -261,7 +261,7 @@ class History(Rows):
         return 100.0 * float(np.clip(1.0 - received / polled, 0.0, 1.0)) if polled > 0.0 else math.nan
 
     def rate_hz(self, age_s: float = 0.0) -> float:
-        """Return the rate of the last `RATE_RANGES` ranges whose intervals are known, by their stamps; NaN: none is.
+        """Return the rate of the last `RATE_RANGES` ranges whose intervals are known, by their stamps; NaN: unknown.
 
         Args:
             age_s: time since the last range by stamps; the rate decreases if this is several mean intervals, unless the viewer

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -41,6 +41,7 @@ from uwb_mitigation.viewer.scene import (
     MAX_TAGS,
     POSITION,
     Scene,
+    antenna_position,
     tag_label,
     tag_name,
 )
@@ -329,7 +330,9 @@ def estimate_tracks(
                 _add_incidents(scene, tag_label(name, None), rows, recording.seconds)
             with scene.lock:
                 scene.set_track(name, kind, rows)
-    add_residuals(scene, config.anchors)
+    # Tracks are those of the antenna, poses those of the robot.
+    is_of_robot = topics.POSE in recording.contents
+    add_residuals(scene, config.anchors, scene.lever_arms if is_of_robot else {})
 
 
 def _add_incidents(scene: Scene, label: str, track: NDArray[np.float64], seconds: float) -> None:
@@ -343,16 +346,21 @@ def _add_incidents(scene: Scene, label: str, track: NDArray[np.float64], seconds
     scene.incidents.count += incidents.count - len(incidents.latest)
 
 
-def add_residuals(scene: Scene, anchors: AnchorMap) -> None:
-    """Set the residuals of ranges: NaN without a recent position, or if the anchor is not in the map."""
+def add_residuals(
+    scene: Scene, anchors: AnchorMap, lever_arms: Mapping[str, tuple[float, float, float]] = {}
+) -> None:
+    """Set the residuals of ranges: NaN without a recent position, or if the anchor is not in the map; see `Scene.lever_arms`."""
     place = {anchor.id: anchor.position for anchor in anchors.anchors}
     tracks = {name: track.rows for (name, kind), track in scene.tracks.items() if kind is TrackKind.CORRECTED}
     for (anchor_id, tag_id), history in scene.pairs.items():
         track, columns = tracks.get(tag_name(tag_id, tracks, scene.pairs)), history.columns
         if track is None or anchor_id not in place:
             continue
-        _, *position, _, at_s = track[np.argsort(track[:, 5], kind="stable"), :6].T
-        x, y, z = (np.interp(columns.stamp_s, at_s, axis) for axis in position)
+        track = track[np.argsort(track[:, 5], kind="stable")]
+        arm, position, at_s = lever_arms.get(format_id(tag_id)), track[:, 1:4], track[:, 5]
+        if arm is not None:
+            position = antenna_position(position, track[:, -1], arm)
+        x, y, z = (np.interp(columns.stamp_s, at_s, axis) for axis in position.T)
         distance_m = np.linalg.norm(np.column_stack([x, y, np.nan_to_num(z)]) - place[anchor_id], axis=1)
         latest = np.maximum(np.searchsorted(at_s, columns.stamp_s, side="right") - 1, 0)
         is_recent = np.abs(columns.stamp_s - at_s[latest]) < NO_DATA_S

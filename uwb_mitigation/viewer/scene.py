@@ -6,7 +6,6 @@ limit.
 
 from __future__ import annotations
 
-import cmath
 import math
 import time
 from bisect import bisect_right
@@ -144,7 +143,7 @@ class Scene:
         pairs: {(anchor, tag): history of its last minute}, the latest at the end.
         tags, anchors, node_statuses: {id or name: ...}.
         tracks: {(name, kind): positions, with the columns of `POSITION`}.
-        lever_arms: {tag: position of its antenna in the frame of its poses, m}.
+        lever_arms: {tag id as text: position of its antenna in the frame of its poses, m}; only those that are not 0.
         reports: (time of reception, name, diagnostics) of a recording.
         latest_stamps: {tag: (its latest stamp, time of its reception)}.
         revision: increases with every change, so that a page draws only changes.
@@ -336,11 +335,9 @@ class Scene:
         anchor, pose = self.anchors.get(pair[0]), self.tag_of(pair[1])
         if pose is None or anchor is None or self.age_s(pose) > NO_DATA_S:
             return math.nan
-        arm_x, arm_y, arm_z = self.lever_arms.get(f"tag {format_id(pair[1])}", (0.0, 0.0, 0.0))
-        turn = cmath.exp(1j * pose.heading_rad) * complex(arm_x, arm_y)
-        # Without a heading, the locator publishes the horizontal position of the antenna.
-        turn = turn if cmath.isfinite(turn) else 0j
-        pose = replace(pose, x=pose.x + turn.real, y=pose.y + turn.imag, z=pose.z + arm_z)
+        if (arm := self.lever_arms.get(format_id(pair[1]))) is not None:
+            x, y, z = antenna_position(np.array([pose.x, pose.y, pose.z]), pose.heading_rad, arm).tolist()
+            pose = replace(pose, x=x, y=y, z=z)
         self._locate_raw(pair, pose, sample)
         # On a busy computer, positions arrive late.
         if abs(pose.stamp_s - sample.stamp_s) * pose.speed > MAX_MOVED_M:
@@ -409,6 +406,23 @@ class Scene:
     def tag_of(self, tag_id: int) -> Pose | None:
         """Return the position of the tag of a range; None: it has none."""
         return self.tags.get(tag_name(tag_id, self.tags, self.pairs))
+
+
+def antenna_position(
+    position: NDArray[np.float64],
+    heading_rad: NDArray[np.float64] | float,
+    arm: tuple[float, float, float],
+) -> NDArray[np.float64]:
+    """Return positions of an antenna, float64 (..., 3), m, from those of a robot as the locator publishes them.
+
+    Without a heading (NaN), their x and y are those of the antenna.
+    """
+    x, y, z = arm
+    turned = np.nan_to_num(np.exp(1j * np.asarray(heading_rad)) * complex(x, y))
+    result: NDArray[np.float64] = position + np.stack(
+        [turned.real, turned.imag, np.full(turned.shape, z)], axis=-1
+    )
+    return result
 
 
 def plain_tag_id(names: Container[str], pairs: Iterable[Pair]) -> int | None:

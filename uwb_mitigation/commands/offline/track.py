@@ -133,7 +133,8 @@ def worst_displaced(residuals: Sequence[HoldoutErrors]) -> dict[int, tuple[float
     anchors, several accusations contradict each other: blocked ranges of one bend the three tracks without the others.
     """
     displaced = [(row.raw_m, row.fitted) for row in residuals if row.fitted is not None]
-    if not displaced or len(residuals) - 1 <= MIN_OTHERS + 1 < MIN_OTHERS + len(displaced):
+    num_anchors = sum(row.anchor_id is not None and row.ranges > 0 for row in residuals)
+    if not displaced or (len(displaced) > 1 and num_anchors <= MIN_OTHERS + 1):
         return {}
     worst = max(displaced, key=lambda row: row[0])
     return {worst[1].id: worst}
