@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -168,6 +169,32 @@ def test_anchors_at_wrong_positions_are_named_by_their_ids(recorded, rows, place
     position = HALL.position.copy()
     position[rows] = places
     refused(named, HALL.moved(position, HALL.sd), [recorded[0]], height=LEVEL)
+
+
+def test_four_anchors_show_a_displacement_that_the_track_follows():
+    def notes(swing_m, wrong_m):
+        def weave(time_s):
+            swing = np.stack([np.cos(0.2 * time_s), np.sin(0.31 * time_s)], axis=1) * swing_m
+            return np.insert(np.add(swing, (6.0, 4.5)), 2, 1.0, axis=1)
+
+        ranges, _ = drive(seconds=120, rate_hz=10.0, path=weave)
+        ranges = ranges.take(ranges.anchor < 4)
+        predicted = Regressors.single("network", np.zeros(len(ranges)), 1.0, 0.03)
+        wrong = HALL.position + np.outer(np.arange(5) == 2, (*wrong_m, 0.0))
+        return self_calibrate(HALL.moved(wrong, HALL.sd), [ranges], predicted, height=LEVEL).notes
+
+    assert not notes((5.0, 4.0), (0.0, 0.0))
+    (note,) = notes((5.0, 4.0), (0.5, -0.6))
+    fits = re.match(
+        r"anchor 3 may be displaced: .* x = (.*) m, y = (.*) m \(.* deviation (.*) m\), 0.9 m", note
+    )
+    assert fits, note
+    x, y, sd = map(float, fits.groups())
+    assert (x, y) == pytest.approx(HALL.position[2, :2], abs=0.3)
+    assert 0.1 < sd < 0.4
+    # Along a line, offsets of the anchors explain the same ranges.
+    (note,) = notes((4.0, 0.5), (0.5, -0.6))
+    assert re.match(r"a position of anchor . that is wrong by up to 0.9 m is not noticed", note), note
 
 
 def test_ranges_in_feet_are_refused(recorded):

@@ -6,6 +6,7 @@ direction to the tag. So each hypothesis competes with the position of the file 
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
 from dataclasses import dataclass, replace
@@ -54,6 +55,8 @@ class HypothesisLimits:
         trial_ranges: number of ranges with which a pair is tried; `mean_gain`: minimum gain of a range, in addition to
             `swap_share`.
         no_position_loss: loss of a range without a position: that of a large outlier.
+        displacement_sd_m: prior standard deviation of a displacement that is fitted together with the track.
+        unnoticed_m: a larger displacement that is not noticed is reported.
     """
 
     displacement_m: float = 0.3
@@ -75,12 +78,17 @@ class HypothesisLimits:
     trial_ranges: int = 1000
     mean_gain: float = 0.1
     no_position_loss: float = 6.0
+    displacement_sd_m: float = 1.0
+    unnoticed_m: float = 0.6
 
 
 LIMITS = HypothesisLimits()
 
 _MAX_ANCHOR_RANGES, _SIMPLEX_M = 1000, 0.5
 """Ranges of an anchor that are used, which limits the time, and the first step of the search for a better position."""
+
+_LINEARISATIONS = 2
+"""Fits of a displacement together with the track: the directions of the ranges change little with it."""
 
 _REMEDY = "their true positions in the anchors file (`uwb-mitigation survey` finds them)"
 
@@ -298,6 +306,57 @@ def check_anchors(segments: Segments, fit: JointFit, antenna: NDArray[np.float64
     ranges = replace(segments.ranges, range_m=segments.ranges.range_m - correction_m)
     hypotheses = AnchorHypotheses(fit.config.anchors, ranges, antenna, segments.tag)
     hypotheses.check("the others", is_independent=False)
+
+
+def displacement_note(fit: JointFit) -> str:
+    """Return which anchor is likely displaced, or which displacement is not noticed; empty: neither.
+
+    Unlike in `AnchorHypotheses`, tracks and offsets are fitted again with each displacement, so that few anchors suffice: a
+    track that follows a displaced anchor hides it from the others. Walls can look the same.
+    """
+    fits = {}
+    for row in np.unique(fit.observations.anchor).tolist():
+        with contextlib.suppress(DatasetError):
+            fits[row] = _displaced(fit, row)
+    moved = {
+        row: gain
+        for row, (anchor, gain) in fits.items()
+        if math.dist(anchor.position, fit.config.anchors.position[row]) > LIMITS.displacement_m
+    }
+    row = max(moved, key=moved.__getitem__, default=None)
+    if row is not None and moved[row] > LIMITS.gain:
+        anchor = fit.config.anchors.anchors[row]
+        return f"anchor {anchor} may be displaced: {fit_text(anchor, fits[row][0])}. Walls can look the same: measure it again"
+    anchor, _ = max(fits.values(), key=lambda of_anchor: of_anchor[0].sd)
+    if 2.0 * anchor.sd > LIMITS.unnoticed_m:
+        return (
+            f"a position of anchor {anchor} that is wrong by up to {2.0 * anchor.sd:.1f} m is not noticed: drive nearer to it, or "
+            "compare it with `uwb-mitigation survey`"
+        )
+    return ""
+
+
+def _displaced(fit: JointFit, row: int) -> tuple[Anchor, float]:
+    """Return an anchor at the position that explains the ranges best together with the tracks, and the gain in log likelihood."""
+    config, observations = fit.config, fit.observations
+    position, refit = config.anchors.position.copy(), fit
+    prior = replace(fit.prior, rows=observations.rows)
+    for _ in range(_LINEARISATIONS):
+        unit, _ = unit_vectors(refit.antenna_position(), position[observations.anchor])
+        columns = np.where((observations.anchor == row)[:, None], -unit[:, :2], 0.0)
+        sds = np.full(2, LIMITS.displacement_sd_m)
+        displacement = Regressors(("x", "y"), columns, np.zeros(2), sds, observations.noise_group)
+        refit = fit_joint(
+            replace(config, anchors=config.anchors.moved(position, config.anchors.sd)),
+            replace(observations, rows=np.hstack([observations.rows, columns])),
+            prior.concat(displacement),
+            Start(refit.position, np.append(fit.parameters, [0.0, 0.0]), is_close=True),
+            fit.scale_m,
+        )
+        position[row, :2] += refit.parameters[-2:]
+    sd = float(np.sqrt(np.trace(refit.covariance[-2:, -2:]) / 2.0))
+    anchor = replace(config.anchors.anchors[row], position=tuple(position[row].tolist()), sd=sd)
+    return anchor, fit.loss - refit.loss
 
 
 def fit_text(anchor: Anchor, fitted: Anchor) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.calibration.first_positions import first_positions, likely_offset
-from uwb_mitigation.calibration.hypotheses import check_anchors
+from uwb_mitigation.calibration.hypotheses import check_anchors, displacement_note
 from uwb_mitigation.calibration.joint_fit import SD_INFLATION, JointFit, Start, fit_segments
 from uwb_mitigation.calibration.motion_segments import Segments, find_segments
 from uwb_mitigation.calibration.observability import check_height, check_layout, check_motion, mirrored
@@ -201,6 +201,8 @@ def self_calibrate(
         # The limits of these checks are for equal thresholds.
         result = solve(MODEL)
         check_anchors(segments, result.fit, result.antenna)
+        if extra.names and (note := displacement_note(result.fit)):
+            result = replace(result, notes=(*result.notes, note))
         if heights_m is None:
             check_height(result.fit)
         if not is_raw:

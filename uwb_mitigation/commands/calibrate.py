@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 MAX_LEVER_ARM_DIFFERENCE_M = 0.01
 BASE_FRAME = "base_link"
 """The robot's frame if the poses do not name it."""
-FEW_ANCHORS = 4
-"""Three simulated drives past four anchors were accepted although one was 0.8 m off: the track follows it."""
 
 
 @options.with_settings("height", "height_sd", "height_topic", "area", "stamp_offset")
@@ -326,12 +324,6 @@ def _show(calibration: SiteCalibration) -> None:
     )
     for note in calibration.notes:
         warn(note)
-    anchors = {anchor for _, anchor in calibration.pairs}
-    if len(anchors) <= FEW_ANCHORS and solution.truth is None:
-        warn(
-            f"with {len(anchors)} anchors, a position that is wrong by up to 1 m may not be noticed: compare them with "
-            "`uwb-mitigation survey`"
-        )
     if solution.outliers:
         warn(f"{solution.outliers} outliers are not included in any result")
     print_line(calibration.summary())
