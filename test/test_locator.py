@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import signal
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from visualization_msgs.msg import MarkerArray
 
 from uwb_mitigation.nodes.support.position_monitor import PositionMonitor
 from uwb_mitigation.positioning.config import EstimatorConfig
+from uwb_mitigation.positioning.geometry import Height
 from uwb_mitigation.positioning.multi_tag import MultiTagEstimator
 from uwb_mitigation.types.anchors import dump_anchors
 from uwb_mitigation.types.measurement import CorrectedBy, CorrectedRange, Status
@@ -126,19 +128,28 @@ def test_ranges_yield_poses_odometry_smoothed_poses_and_markers(ros: Ros, anchor
 @pytest.mark.parametrize(
     ("changes", "anchors", "expected"),
     [
-        ({}, [1, 2, 3, 4, 5], "Position of tag 7 good: horizontal sd 0"),
-        ({3: 0.8}, [1, 2, 3, 4, 5], "Position of tag 7 degraded: Anchor 3 reads 0.3"),
+        ({}, [1, 2, 3, 4, 5], r"good: horizontal sd 0.\d\d m, 95 % within 0.\d\d m"),
+        (
+            {2: 0.5},
+            [1, 2, 3, 4, 5],
+            r"degraded: Anchor 2 reads 0.\d\d m long. Calibrate, or check its position",
+        ),
+        (
+            {1: 0.9, 4: -0.9},
+            [1, 2, 3, 4, 5],
+            "degraded: Anchor 1 .*: check height and lever arm of the tag, too",
+        ),
         (
             {},
             [1, 2],
-            "Position of tag 7 not determined: unknown: 2 anchors received, 3 or more needed. Remedy: more anchors",
+            "not determined: mirrored position: the 2 received anchors are within .* Remedy: an area on one side.*",
         ),
     ],
 )
 def test_verdict_has_the_sentences_of_the_viewer(
     changes: dict[int, float], anchors: list[int], expected: str
 ):
-    estimator, now_s = MultiTagEstimator(EstimatorConfig(HALL)), [0.0]
+    estimator, now_s = MultiTagEstimator(EstimatorConfig(HALL, height=Height(1.0))), [0.0]
     monitor = None
     ranges, _ = drive(seconds=20)
     for i in range(len(ranges)):
@@ -153,8 +164,9 @@ def test_verdict_has_the_sentences_of_the_viewer(
             monitor.add(
                 anchor, CorrectedRange(range_m, range_m, 0.0, 0.01, Status.OK, CorrectedBy.HOST, 1), estimate
             )
-    assert monitor.sentence()[1].startswith(expected)
-    assert monitor.sentence()[0] == ("good" in expected)
+    is_good, text = monitor.sentence()
+    assert re.fullmatch(f"Position of tag 7 {expected}", text), text
+    assert is_good == expected.startswith("good")
     now_s[0] += 12.0
     lost = "Position of tag 7 lost: no ranges of tag 7 for 12 s. Check power of the tag, and the driver"
     assert monitor.sentence() == (False, lost)

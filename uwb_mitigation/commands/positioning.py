@@ -254,7 +254,9 @@ def _show_residuals(residuals: list[HoldoutErrors], anchors: AnchorMap) -> None:
     )
     accused = [(row["anchor"], row["residual"].fitted) for row in rows if row["residual"].fitted is not None]
     for anchor, fitted in accused:
-        warn(f"anchor {anchor}: {fit_text(anchor, fitted)}. Measure its position again.")
+        warn(
+            f"anchor {anchor}: {fit_text(anchor, fitted)}. Check height and lever arm of the tag, and measure the anchor again."
+        )
     if len(accused) > 1:
         warn(
             "One cause is enough for several anchors: one wrong position, or a blocked line of sight, also of an anchor that is not named."

@@ -86,6 +86,8 @@ class PositionMonitor:
                 bad, key=lambda key: [abs(anchors[key][n]) for n in ("stopped", "residual")], default=0
             )
             reason, _, action = (common or texts[worst]).partition(": ")
+            if not common and sum(abs(means["residual"]) > LONG_M for means in anchors.values()) > 1:
+                action += " Several anchors read wrong: check height and lever arm of the tag, too."
         elif sd_m > health.MAX_SD_M:
             reason, action = (
                 f"uncertain by {sd_m:.2f} m",
@@ -97,9 +99,8 @@ class PositionMonitor:
         """Return whether the position is good, and the verdict as text."""
         verdict = self.verdict()
         is_good = verdict.state == health.POSITION_GOOD
-        detail = (
-            f": {verdict.accuracy}" if is_good else verdict.action and f". {verdict.action}".removesuffix(".")
-        )
+        action = verdict.action and f". {verdict.action[0].upper()}{verdict.action[1:]}".removesuffix(".")
+        detail = f": {verdict.accuracy}" if is_good else action
         return is_good, verdict.headline(f" of {self.name}") + detail
 
     def _means(self) -> dict[int, Means]:
