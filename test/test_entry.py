@@ -45,11 +45,12 @@ def test_help_lists_every_parameter_without_ros(node: str, tables: list[str], tm
     assert all(f"\n  {row.name}:=" in output for table in tables for row in TABLES[table])
 
 
-def test_module_without_a_node_names_the_nodes_in_one_line():
-    command = [sys.executable, "-m", "uwb_mitigation.commands.entry"]
+@pytest.mark.parametrize(("words", "code"), [([], 1), (["--help"], 0)])
+def test_module_without_a_node_names_the_nodes_in_one_line(words: list[str], code: int):
+    command = [sys.executable, "-m", "uwb_mitigation.commands.entry", *words]
     done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
-    assert done.returncode == 1
-    (line,) = done.stderr.splitlines()
+    assert done.returncode == code
+    (line,) = (done.stdout if code == 0 else done.stderr).splitlines()
     assert "driver, mitigator, locator" in line
 
 

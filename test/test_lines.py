@@ -23,6 +23,8 @@ from benchmarks.equipment.emulated_board import PseudoTerminal
 from benchmarks.equipment.text_board import KINDS, PansShell, TextBoards
 from uwb_mitigation.commands import cli
 from uwb_mitigation.errors import DamagedRecordingError, RecordingError
+from uwb_mitigation.mitigation.model.choice import CirKind, choose_model
+from uwb_mitigation.mitigation.model.shipped import load_model
 from uwb_mitigation.nodes.support.parameter_tables import RESPAWN_FOLDER
 from uwb_mitigation.radios import lines, uci
 from uwb_mitigation.radios.lines import LineSession
@@ -71,6 +73,22 @@ FIRST, SECOND = (0x022E, 3.44), (0x9280, 15.68)
 def test_shell_commands_of_a_dwm1001_are_read_and_cut_lines_give_no_wrong_range(line: str, ranges: list):
     # Without an id of its own, a board has the number of its port.
     assert read(session_of("dwm1001_pans", 2), line + "\r\n") == [(3, *found) for found in ranges]
+
+
+def test_lines_of_own_firmware_may_contain_the_cir():
+    fields = {"anchor": "anchor", "range": "range", "first_path_index": "fp"}
+    text = {
+        "name": "own",
+        "pattern": r"R (?P<anchor>\d+) (?P<range>\S+) (?P<fp>\S+) (?P<cir>[-\d,]+)",
+        "fields": fields,
+    }
+    cir = {"cir": {"column": "cir", "samples": "interleaved"}, "radio": "DW3000", "segment": "IPATOV"}
+    session = LineSession(Mapping(**text, **cir))
+    (measured,) = session.receive(b"\nR 3 5.02 1.25 7,-8,4000,3000\n", 0, 5)
+    assert (measured.anchor_id, measured.range_m, measured.cir.first_path_index) == (3, 5.02, 1.25)
+    assert measured.cir.samples.tolist() == [7, -8, 4000, 3000]
+    # As the pages say: no shipped model was trained for the preamble of a DW3000.
+    assert not choose_model(load_model(), CirKind.of(measured.cir)).fits
 
 
 def test_a_timeout_of_the_cli_image_is_counted_and_not_a_range():

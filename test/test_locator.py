@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import signal
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
+from diagnostic_msgs.msg import DiagnosticStatus
 from drives import HALL, NANOSECONDS, drive
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
@@ -21,7 +23,12 @@ from tf2_msgs.msg import TFMessage
 from uwb_mitigation_msgs.msg import RangeCorrected
 from visualization_msgs.msg import MarkerArray
 
+from uwb_mitigation.nodes.support.position_monitor import PositionMonitor
+from uwb_mitigation.positioning.config import EstimatorConfig
+from uwb_mitigation.positioning.geometry import Height
+from uwb_mitigation.positioning.multi_tag import MultiTagEstimator
 from uwb_mitigation.types.anchors import dump_anchors
+from uwb_mitigation.types.measurement import CorrectedBy, CorrectedRange, Status
 from uwb_mitigation.types.stamps import to_ns
 
 pytestmark = pytest.mark.ros
@@ -77,7 +84,13 @@ def test_ranges_yield_poses_odometry_smoothed_poses_and_markers(ros: Ros, anchor
     run.send(range(half, len(run.ranges)))
     run.send(range(half), tag_id=9)
     ros.spin_until(lambda: len(second) > 20)
-    status = ros.diagnosis("locator", lambda s: diagnostic_values(s).get("ranges of unknown anchors") == "3")
+
+    def is_current(status: DiagnosticStatus) -> bool:
+        run.send(range(len(run.ranges) - 1, len(run.ranges)))
+        values = diagnostic_values(status)
+        return values.get("ranges of unknown anchors") == "3" and "tag 7 HDOP" in values
+
+    status = ros.diagnosis("locator", is_current)
     moving = [pose for pose in poses if stamp_ns(pose) < run.start_ns + 18 * NANOSECONDS]
     errors = run.errors(moving)
     known = np.isfinite(errors)
@@ -103,7 +116,60 @@ def test_ranges_yield_poses_odometry_smoothed_poses_and_markers(ros: Ros, anchor
     names = {(marker.ns, marker.id) for marker in shown[0].markers}
     assert {("anchors", row) for row in range(len(HALL))} <= names
     assert late is not None
+    # Of a tag that was switched off, nothing that was true before is repeated.
+    status = ros.diagnosis("locator", lambda s: "Position of tag 9 lost: no ranges of tag 9 for" in s.message)
+    assert {key for key in diagnostic_values(status) if key.startswith("tag 9 ")} == {
+        "tag 9 lever arm",
+        "tag 9 position",
+    }
     assert locator.signal(signal.SIGINT) == 0, locator.output
+
+
+@pytest.mark.parametrize(
+    ("changes", "anchors", "expected"),
+    [
+        ({}, [1, 2, 3, 4, 5], r"good: horizontal sd 0.\d\d m, 95 % within 0.\d\d m"),
+        (
+            {2: 0.5},
+            [1, 2, 3, 4, 5],
+            r"degraded: Anchor 2 reads 0.\d\d m long. Calibrate, or check its position",
+        ),
+        (
+            {1: 0.9, 4: -0.9},
+            [1, 2, 3, 4, 5],
+            "degraded: Anchor 1 .*: check height and lever arm of the tag, too",
+        ),
+        (
+            {},
+            [1, 2],
+            "not determined: mirrored position: the 2 received anchors are within .* Remedy: an area on one side.*",
+        ),
+    ],
+)
+def test_verdict_has_the_sentences_of_the_viewer(
+    changes: dict[int, float], anchors: list[int], expected: str
+):
+    estimator, now_s = MultiTagEstimator(EstimatorConfig(HALL, height=Height(1.0))), [0.0]
+    monitor = None
+    ranges, _ = drive(seconds=20)
+    for i in range(len(ranges)):
+        anchor = HALL.anchors[ranges.anchor[i]]
+        if anchor.id in anchors:
+            now_s[0], range_m = (
+                ranges.stamp_ns[i] / NANOSECONDS,
+                ranges.range_m[i] + changes.get(anchor.id, 0.0),
+            )
+            tag, estimate = estimator.add(7, anchor.id, int(ranges.stamp_ns[i]), range_m, 0.01)
+            monitor = monitor or PositionMonitor(tag, lambda: now_s[0])
+            monitor.add(
+                anchor, CorrectedRange(range_m, range_m, 0.0, 0.01, Status.OK, CorrectedBy.HOST, 1), estimate
+            )
+    is_good, text = monitor.sentence()
+    assert re.fullmatch(f"Position of tag 7 {expected}", text), text
+    assert is_good == expected.startswith("good")
+    now_s[0] += 12.0
+    lost = "Position of tag 7 lost: no ranges of tag 7 for 12 s. Check power of the tag, and the driver"
+    assert monitor.sentence() == (False, lost)
 
 
 def test_gap_is_bridged_by_predictions_with_growing_covariance(ros: Ros, anchors: Path):
@@ -142,7 +208,9 @@ def test_absent_mitigator_and_a_second_locator_are_reported(ros: Ros, anchors: P
     locator.wait_for_output(remedy)
     run = Drive(ros, seconds=5)
     run.send(range(100))
-    ros.diagnosis("locator", lambda status: status.message == "locating")
+    ros.diagnosis(
+        "locator", lambda status: status.message.startswith("Position of tag 7 good: horizontal sd")
+    )
     ros.node.create_publisher(PoseWithCovarianceStamped, "/uwb/pose", 10)
     ros.diagnosis("locator", lambda status: "another node publishes /uwb/pose" in status.message)
 

@@ -172,6 +172,16 @@ def test_first_paths_outside_of_the_cirs_are_a_warning(tmp_path: Path):
     source = of(text, tmp_path / "x.csv", fields=fields, cir={"column": "c"})
     (warning,) = [text for text in source.warnings if "first path" in text]
     assert warning.startswith("2 of 3 first paths are outside of their CIRs, such as 3.00 of 3 samples")
+    assert "or with sum: {INDEX: 1, START: -1}" in warning
+    starts = (
+        text.replace("r,f", "r,s,f")
+        .replace(",2,2.9", ",2,1,2.9")
+        .replace(",2,3", ",2,2,3")
+        .replace(",2,740", ",2,739,740")
+    )
+    fields = PLAIN["fields"] | {"first_path_index": {"sum": {"f": 1, "s": -1}}}
+    source = of(starts, tmp_path / "y.csv", fields=fields, cir={"column": "c"})
+    assert [record.measurement.cir.first_path_index for record in source] == pytest.approx([1.9, 1.0, 1.5])
 
 
 def test_real_parts_alone_are_no_complex_samples():

@@ -87,6 +87,9 @@ def test_nlos_is_refused_with_the_evidence(universal: Mitigation, direct: list[R
     levels = [{"first_path_power_dbm": one.measurement.cir.first_path_power_dbm - 9.0} for one in direct]
     with pytest.raises(DatasetError, match=r"not line of sight: the first path is \d+\.\d dB below"):
         estimate_offset(universal, map(changed, direct, levels), 3.0)
+    no_index = {"rx_power_dbm": float("nan"), "first_path_index": float("nan")}
+    with pytest.raises(DatasetError, match="CIRs with levels or a first-path index, or ranges without CIRs"):
+        estimate_offset(universal, (changed(record, no_index) for record in direct), 3.0)
     with pytest.raises(DatasetError, match="check the distance"):
         estimate_offset(universal, longer(direct, 20.0), 3.0)
     with pytest.raises(DatasetError, match="only 5 ranges are in line of sight"):
@@ -95,13 +98,17 @@ def test_nlos_is_refused_with_the_evidence(universal: Mitigation, direct: list[R
         estimate_offset(universal, [replace(record, truth=None) for record in direct[:20]])
 
 
-def test_distance_counts_without_levels_and_cirs_with_a_warning(tmp_path: Path):
-    """Boards that print their ranges have neither: the user saw that the radios stood in line of sight."""
+STS = Cir(np.full(64, 900, np.int16), first_path_index=9.0, radio=RadioType.DW3000, segment=Segment.STS)
+
+
+@pytest.mark.parametrize("cir", [Cir(NO_SAMPLES), STS])
+def test_distance_counts_without_levels_and_cirs_with_a_warning(cir: Cir, tmp_path: Path):
+    """The user saw that the radios stood in line of sight; the few taps of an STS do not show it."""
     with BagWriter(tmp_path / "los.mcap", {}) as out:
         for number in range(20):
             range_m = 5.25 + 0.01 * (number % 2)
-            out.write(Record(RangeMeasurement(10**8 * number, 1, 7, number, 0, range_m, Cir(NO_SAMPLES))))
-    outcome = succeed("offset los.mcap --distance 5", folder=tmp_path)
+            out.write(Record(RangeMeasurement(10**8 * number, 1, 7, number, 0, range_m, cir)))
+    outcome = succeed("offset los.mcap --distance 5 --model universal", folder=tmp_path)
     assert "offset 0.255 m" in outcome.stdout
     assert "line of sight was not checked" in outcome.stderr
 

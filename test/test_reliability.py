@@ -201,6 +201,11 @@ def test_model_that_includes_an_offset_causes_a_warning_after_enough_ranges():
     health.excludes_offset = True
     health.los_m.extend([-0.05] * 1000)
     assert diagnostics.OFFSET.text not in warnings(health)
+    # An offset is in all ranges; the median alone can be that of a few NLOS ranges with a strong first path.
+    health.los_m.extend([0.0] * 400 + [-0.3] * 600)
+    assert diagnostics.OFFSET.text not in warnings(health)
+    health.los_m.extend([-0.3] * 200)
+    assert diagnostics.OFFSET.text in warnings(health)
 
 
 @pytest.mark.parametrize("count", [2, 3, 5])

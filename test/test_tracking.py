@@ -169,11 +169,14 @@ def test_survey_improves_the_anchor_positions(hall: Path, tmp_path: Path):
     off[1] += (0.5, -0.4, 0.0)
     guesses.write_text(dump_anchors(HALL.moved(off, HALL.sd)))
     arguments = ("survey", hall, "-o", found, "--anchors", guesses, "--height", "1.0", "--json", result)
-    succeed(*arguments, folder=tmp_path)
+    hint = "Set --fixed for two or more anchors that are right"
+    assert hint in " ".join(succeed(*arguments, folder=tmp_path).stderr.split())
     assert json.loads(result.read_text())["misplaced"] == [2]
     excerpt = parse_anchors(found.read_text(), "found")
     assert np.linalg.norm(excerpt.position[1] - HALL.position[1]) < 0.5
     assert run(*arguments, folder=tmp_path).returncode != 0
+    fixed = succeed(*arguments, "--force", "--fixed", "1", "--fixed", "3", folder=tmp_path)
+    assert hint not in " ".join(fixed.stderr.split())
 
 
 def test_height_topic_is_used_and_excludes_a_constant_height(tmp_path: Path):

@@ -27,6 +27,7 @@ from uwb_mitigation.types.measurement import (
     CorrectedRange,
     RangeMeasurement,
     Record,
+    Segment,
     Status,
 )
 from uwb_mitigation.types.offsets import MAX_OFFSET_M, Offsets
@@ -159,7 +160,8 @@ def estimate_offset(
             predicted_m = _predicted_m(mitigation, measured, result)
             model = mitigation.bundles[mitigation.choose(CirKind.of(measured.cir)).model]
             gap_db = _power_gap_db(measured, Preprocessing(model.card.preprocessing.samples, Scaling.MAX))
-            label = None if len(measured.cir) else "" if truth is None else truth.label
+            has_preamble_cir = len(measured.cir) > 0 and measured.cir.segment is not Segment.STS
+            label = None if has_preamble_cir else "" if truth is None else truth.label
             is_los = _is_los(gap_db, label)
             offset_m = measured.range_m - predicted_m - true_m
             level_dbm = measured.cir.first_path_power_dbm
@@ -203,10 +205,10 @@ def _is_los(gap_db: float, label: str | None) -> float:
 
     Args:
         gap_db: receive level minus first-path level; NaN: unknown.
-        label: label of a range without a CIR, empty: none; None: the range has a CIR.
+        label: label of a range without a CIR of the preamble, empty: none; None: the range has one.
     """
     if label or (label is not None and math.isnan(gap_db)):
-        # Without a CIR the label decides, then the levels; ranges with neither are used.
+        # Without such a CIR the label decides, then the levels; ranges with neither are used.
         return float(label in ("", "LOS"))
     return float(gap_db < LINE_OF_SIGHT_DB) if math.isfinite(gap_db) else math.nan
 
@@ -214,7 +216,8 @@ def _is_los(gap_db: float, label: str | None) -> float:
 def _power_gap_db(measurement: RangeMeasurement, preprocessing: Preprocessing) -> float:
     """Return receive level minus first-path level, dB, as reported or else from the CIR; NaN if unknown."""
     reported_db = measurement.cir.power_gap_db
-    if math.isfinite(reported_db):
+    # The few taps of an STS are too short for the energy of reflections.
+    if math.isfinite(reported_db) or measurement.cir.segment is Segment.STS:
         return reported_db
     (fault,), (window,) = preprocessing.windows_of([measurement])
     if fault:
@@ -266,7 +269,7 @@ def _combined(placements: tuple[PlacementOffset, ...], model_id: int) -> OffsetE
         more = f" (and {len(placements) - 1} other placements)" if len(placements) > 1 else ""
         raise DatasetError(
             f"anchor {format_id(first.anchor_id)}, tag {format_id(first.tag_id)}: {first.refused}{more}",
-            valid="no obstacles between or next to the antennas",
+            valid="no obstacles between or next to the antennas; CIRs with levels or a first-path index, or ranges without CIRs",
         )
     if (ranges := sum(placement.ranges for placement in accepted)) < MIN_RANGES:
         raise DatasetError(

@@ -109,6 +109,9 @@ def _end(number: int, frame: Any) -> None:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) < 2:
+    if {"-h", "--help"} & set(sys.argv[1:2]):
+        print(f"usage: entry NODE [--help | --ros-args ...] (NODE: {', '.join(_NODES)})")
+    elif len(sys.argv) < 2:
         sys.exit(f"error: no node is named (one of {', '.join(_NODES)})")
-    _node(sys.argv.pop(1))
+    else:
+        _node(sys.argv.pop(1))

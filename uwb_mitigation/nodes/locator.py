@@ -31,6 +31,7 @@ from uwb_mitigation.nodes.robot_motion import (
 )
 from uwb_mitigation.nodes.support import diagnostics, endpoints
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode
+from uwb_mitigation.nodes.support.position_monitor import PositionMonitor
 from uwb_mitigation.nodes.support.respawn import StateFile
 from uwb_mitigation.positioning.config import EstimatorConfig, RobotData
 from uwb_mitigation.positioning.geometry import Area, Height, parse_lever_arm
@@ -90,6 +91,7 @@ class _Outputs:
         self.frame = frame
         self.robot = tag.robot
         self.picture = markers.TagPicture(frame)
+        self.monitor = PositionMonitor(tag)
         self.published_ns = self.smoothed_ns = -(1 << 62)
 
     def all(self) -> tuple[Publisher, ...]:
@@ -192,7 +194,15 @@ class Locator(ManagedNode):
         estimator = self._estimator
         if estimator is None:
             return "host", diagnostics.WARN, "no anchors", {}
-        warnings = estimator.warnings()
+        monitors = [outputs.monitor for outputs in self._outputs.values()]
+        sentences = {monitor.name: monitor.sentence() for monitor in monitors}
+        # The estimators know nothing of the time after the last range of a tag.
+        stale = tuple(f"{monitor.name}{end}" for monitor in monitors if monitor.silent_s for end in ": ")
+        values = {key: value for key, value in estimator.diagnostics().items() if not key.startswith(stale)}
+        warnings = [text for is_good, text in sentences.values() if not is_good]
+        # The sentences contain the statements on ambiguous positions.
+        said = {f"{name}: {values.get(f'{name} determination')}" for name in sentences}
+        warnings += [text for text in estimator.warnings() if not text.startswith(stale) and text not in said]
         for outputs in self._outputs.values():
             if self.count_publishers(outputs.pose.topic_name) > 1:
                 warnings.append(
@@ -205,14 +215,16 @@ class Locator(ManagedNode):
         if self._robot is not None and (warning := self._robot.warning()):
             warnings.insert(0, warning)
             self.get_logger().warning(warning, throttle_duration_sec=60.0)
-        level, text = diagnostics.OK, "locating" if estimator.tags else "no ranges yet"
+        good = "; ".join(text for _, text in list(sentences.values())[:5])
+        level, text = diagnostics.OK, good or "no ranges yet"
         if warnings:
             level, text = diagnostics.WARN, "; ".join(warnings[:5])
-        values = estimator.diagnostics() | {"dropped by a queue": self._lost, "malformed": self._malformed}
-        values |= {
-            f"tag {format_id(tag_id)} lever arm": ",".join(f"{m:.3f}" for m in self._lever_arm_of(outputs))
-            for tag_id, outputs in self._outputs.items()
-        }
+        values |= {"dropped by a queue": self._lost, "malformed": self._malformed}
+        for outputs in self._outputs.values():
+            values[f"{outputs.monitor.name} lever arm"] = ",".join(
+                f"{m:.3f}" for m in self._lever_arm_of(outputs)
+            )
+            values[f"{outputs.monitor.name} position"] = sentences[outputs.monitor.name][1]
         values |= self._meter.entries()
         durations_ns, self._processing_ns = self._processing_ns, []
         values |= diagnostics.percentiles("processing", durations_ns)
@@ -301,7 +313,9 @@ class Locator(ManagedNode):
             return
         tag, estimate = result
         outputs = self._outputs_of(tag)
-        outputs.picture.statuses[estimator.anchors.index[key.anchor_id]] = corrected.status
+        row = estimator.anchors.index[key.anchor_id]
+        outputs.picture.statuses[row] = corrected.status
+        outputs.monitor.add(estimator.anchors.anchors[row], corrected, estimate)
         held_estimate = None
         if estimate is None and self._robot is not None and outputs.robot is not None:
             held_estimate = self._robot.without_estimate(stamp_ns)

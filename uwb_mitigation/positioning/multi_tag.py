@@ -272,7 +272,8 @@ class MultiTagEstimator:
                     )
             contradicting = [self.anchors.anchors[row] for row in estimator.disagreeing()]
             warnings += [
-                f"{name}: ranges of anchor {anchor} do not fit: blocked, or wrong in the anchors file"
+                f"{name}: ranges of anchor {anchor} do not fit: blocked, wrong in the anchors file, or a wrong height or "
+                "lever arm of the tag"
                 for anchor in contradicting
             ]
         return warnings

@@ -140,7 +140,7 @@ def track_tag(recording: TagRecording, config: EstimatorConfig) -> TagTracks:
     if robot is not None and (times := robot.tag.counts["odometry wrong"]):
         warnings.append(
             f"odometry contradicted the ranges {times} times and was not used then: wheels that slip, a robot moved by hand, "
-            "wrong axes, scale or signs"
+            "wrong axes, scale, signs or lever arm"
         )
     warnings += _smoothing_warnings(errors["live"], errors["smoothed"], is_unique=determined.is_unique)
     return TagTracks(

@@ -6,7 +6,7 @@ import math
 import statistics
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -114,14 +114,15 @@ SLOW = Threshold("p99 of the processing time, ms", 20.0, "correction is slow: th
 NO_RANGES = Threshold("s without a range", 5.0, "no ranges received")
 ALL_REJECTED = Threshold("s in which every range was rejected", 5.0, "every range is rejected")
 OFFSET = Threshold(
-    "absolute median predicted error of LOS ranges, m",
+    "absolute predicted error that three quarters of the LOS ranges exceed, m",
     0.15,
-    "the median correction of LOS ranges is large: the model probably includes the antenna delay of other "
+    "the correction of most LOS ranges is large: the model probably includes the antenna delay of other "
     "boards; calibrate offsets",
 )
 
 MAX_LOS, MIN_LOS = 1000, 200
-"""Maximum and minimum number of latest LOS ranges whose median is compared with OFFSET."""
+"""Maximum and minimum number of latest LOS ranges that are compared with OFFSET. Their median is above its limit for seconds at some
+places of drives with right offsets, in which NLOS ranges look like LOS; their quartile is not."""
 
 MAX_PAIRS = 20
 """Maximum number of pairs of radios that are listed for each model."""
@@ -143,8 +144,7 @@ class MitigatorHealth:
         misfit: why no model, or not the named one, can correct a CIR of this period; empty: none.
         rejected: the last CIR whose range was not corrected, since the model was set.
         los_m: predicted errors of the latest LOS ranges without the offsets of the radios.
-        excludes_offset: whether the predicted errors do not contain the radios' offset, so that the median of `los_m`
-            is near 0.
+        excludes_offset: whether the predicted errors do not contain the radios' offset, so that `los_m` is near 0.
     """
 
     def __init__(
@@ -217,7 +217,7 @@ class MitigatorHealth:
             SLOW: float(np.percentile(processing_ns, 99)) / 1e6 if processing_ns else 0.0,
             NO_RANGES: self._now_s() - self._last_s,
             ALL_REJECTED: self._last_s - self._rejected_since_s,
-            OFFSET: abs(median_m) if self.excludes_offset and len(los_m) >= MIN_LOS else 0.0,
+            OFFSET: _common_error_m(los_m) if self.excludes_offset and len(los_m) >= MIN_LOS else 0.0,
         }
         entries: dict[str, object] = {f"ranges {status.name}": self.statuses[status] for status in Status}
         corrected = sum(self.statuses[status] for status in CORRECTED)
@@ -290,6 +290,12 @@ class LossCounter:
         self.missing += number - nearest - 1
         self._last.remove(nearest)
         self._last.append(number)
+
+
+def _common_error_m(errors_m: Sequence[float]) -> float:
+    """Return the absolute error that three quarters of errors of one sign exceed, m; 0 or less: they differ."""
+    low, high = np.percentile(errors_m, (25, 75))
+    return float(max(low, -high))
 
 
 def _drain(values: deque[int]) -> list[int]:

@@ -183,7 +183,9 @@ def _initialise() -> None:
     except RuntimeError as error:
         # Without positions in the source files of ROS.
         first_line = str(error).strip().splitlines()[0].split(", at /")[0]
-        raise ParameterError(first_line, valid="check what follows --ros-args") from error
+        raise ParameterError(
+            first_line, valid="check what follows --ros-args, and the environment: ROS_..., RMW_..."
+        ) from error
     if unknown := remove_ros_args(words)[1:]:
         raise ParameterError(
             f"arguments {' '.join(unknown)!r}", valid="parameters follow --ros-args, as in -p name:=value"

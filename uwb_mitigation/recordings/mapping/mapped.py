@@ -120,7 +120,7 @@ class MappedRecording(Source):
             example = f"{index[outside[0]]:.2f} of {self._cirs.samples(int(numbers[outside[0]]))} samples"
             self.warnings.append(
                 f"{len(outside)} of {len(rows)} first paths are outside of their CIRs, such as {example}: if these are windows, "
-                "set first_path_index with offset: -START, the index of their first sample"
+                "set first_path_index with offset: -START, the index of their first sample, or with sum: {INDEX: 1, START: -1}, two columns"
             )
 
     def __len__(self) -> int:

@@ -1,0 +1,119 @@
+"""The verdict on the position of a tag in the diagnostics of the locator, by the rules and with the sentences of the viewer."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import defaultdict, deque
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from uwb_mitigation.errors import format_id
+from uwb_mitigation.positioning.determination import current_determination
+from uwb_mitigation.positioning.multi_tag import TagState
+from uwb_mitigation.types.anchors import Anchor
+from uwb_mitigation.types.measurement import CorrectedRange
+from uwb_mitigation.types.tracks import Estimate
+from uwb_mitigation.viewer import health
+from uwb_mitigation.viewer.health import LONG_M, RADIUS95, Means, Verdict
+from uwb_mitigation.viewer.histories import HISTORY_S, NO_DATA_S
+
+MAX_RANGES = 50
+"""Number of latest ranges of an anchor whose mean residual is compared with the limits."""
+
+
+class _Residual(NamedTuple):
+    """Reception of a range, s; range minus distance to the estimate, m, NaN without one; whether its correction is uncertain."""
+
+    received_s: float
+    residual_m: float
+    is_uncertain: bool
+
+
+class PositionMonitor:
+    """Receives the ranges and estimates of one tag.
+
+    Args:
+        tag: its estimators.
+        now_s: a steady clock: stamps of ranges may be on another one.
+    """
+
+    def __init__(self, tag: TagState, now_s: Callable[[], float] = time.monotonic) -> None:
+        self.name = f"tag {format_id(tag.tag_id)}"
+        self._tag, self._now_s = tag, now_s
+        self._received_s = now_s()
+        self._estimate: Estimate | None = None
+        self._residuals = defaultdict[Anchor, deque[_Residual]](lambda: deque(maxlen=MAX_RANGES))
+
+    @property
+    def silent_s(self) -> float:
+        """Time since the last range, s; 0 while ranges arrive: what is known of the tag is current."""
+        age_s = self._now_s() - self._received_s
+        return age_s if age_s > NO_DATA_S else 0.0
+
+    def add(self, anchor: Anchor, corrected: CorrectedRange, estimate: Estimate | None) -> None:
+        """Add a range, and the estimate of the antenna after it."""
+        self._received_s, self._estimate = self._now_s(), estimate
+        residual_m = math.nan
+        if estimate is not None:
+            residual_m = corrected.range_m - math.dist(estimate.position, anchor.position)
+        # The power gap of the CIR, with which the viewer recognises NLOS, is not in corrected ranges.
+        is_uncertain = corrected.status.is_corrected and corrected.variance_m2 > LONG_M**2
+        self._residuals[anchor].append(_Residual(self._received_s, residual_m, is_uncertain))
+
+    def verdict(self) -> Verdict:
+        """Return the verdict on the latest position."""
+        if self.silent_s:
+            reason = f"no ranges of {self.name} for {self.silent_s:.0f} s"
+            return Verdict(health.LOST, reason, "Check power of the tag, and the driver.")
+        current, estimate = current_determination(self._tag.estimator), self._estimate
+        statement, _, remedy = str(current).partition(". Remedy: ")
+        if estimate is None:
+            reason = f"no position of {self.name}" if current.is_unique else statement
+            return Verdict(health.UNDETERMINED, reason, remedy and f"Remedy: {remedy}")
+        sd_m = math.sqrt(np.trace(estimate.covariance[:2, :2]))
+        accuracy = f"horizontal sd {sd_m:.2f} m, 95 % within {RADIUS95 * sd_m:.2f} m"
+        anchors = self._means()
+        common, texts = health.advice(anchors, {anchor.id: anchor.name for anchor in self._residuals})
+        bad = [key for key, means in anchors.items() if health.state(means) == health.BAD]
+        reason, action = "", ""
+        if not current.is_unique:
+            reason, action = statement, remedy and f"Remedy: {remedy}"
+        elif common or bad:
+            worst = max(
+                bad, key=lambda key: [abs(anchors[key][n]) for n in ("stopped", "residual")], default=0
+            )
+            reason, _, action = (common or texts[worst]).partition(": ")
+            if not common and sum(abs(means["residual"]) > LONG_M for means in anchors.values()) > 1:
+                action += " Several anchors read wrong: check height and lever arm of the tag, too."
+        elif sd_m > health.MAX_SD_M:
+            reason, action = (
+                f"uncertain by {sd_m:.2f} m",
+                "Add an anchor, or set height and area of the locator.",
+            )
+        return Verdict(health.DEGRADED if reason else health.POSITION_GOOD, reason, action, accuracy)
+
+    def sentence(self) -> tuple[bool, str]:
+        """Return whether the position is good, and the verdict as text."""
+        verdict = self.verdict()
+        is_good = verdict.state == health.POSITION_GOOD
+        action = verdict.action and f". {verdict.action[0].upper()}{verdict.action[1:]}".removesuffix(".")
+        detail = f": {verdict.accuracy}" if is_good else action
+        return is_good, verdict.headline(f" of {self.name}") + detail
+
+    def _means(self) -> dict[int, Means]:
+        """Return the means of each anchor that was received in the last minute, as the viewer has them of its pairs."""
+        result, now_s = dict[int, Means](), self._now_s()
+        for anchor, rows in self._residuals.items():
+            age_s = now_s - rows[-1].received_s
+            known_m = [row.residual_m for row in rows if not math.isnan(row.residual_m)]
+            if age_s < HISTORY_S:
+                result[anchor.id] = dict.fromkeys(("rate", "lost", "not_ok", "displaced"), 0.0) | {
+                    "residual": sum(known_m) / len(known_m) if known_m else math.nan,
+                    "evidence": float(len(known_m)),
+                    "nlos": 100.0 * sum(row.is_uncertain for row in rows) / len(rows),
+                    "stopped": age_s if age_s > NO_DATA_S else 0.0,
+                }
+        return result
