@@ -102,7 +102,7 @@ def calibrated(records) -> list[Record]:
     return [changed(record, range_m=record.measurement.range_m - offset) for record in records]
 
 
-@pytest.mark.parametrize("decibels", [-25, *range(-20, -8), -7, -5, 0, 3, 5, 8, 10, 15, 20])
+@pytest.mark.parametrize("decibels", [-25, *range(-20, -8), -5, 0, 5, 10, 20])
 def test_universal_model_does_not_harm_at_any_level(decibels, universal, calibrated):
     outcome = accuracy(universal, calibrated, louder(decibels))
     assert outcome.corrected.mae <= 1.02 * outcome.raw.mae
