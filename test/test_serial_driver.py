@@ -144,7 +144,7 @@ def test_unplugging_leaks_no_descriptors_or_threads(ros: Ros, link: Path):
         before = open_files_and_threads(driver)
         for opening in range(2, 6):
             device.unplug()
-            ros.spin_for(0.1)
+            ros.spin_until(lambda n=opening: driver.output.count("disconnected from the board") == n - 1)
             device.plug()
             # Older ranges may still arrive: wait until the driver reports the connection.
             ros.diagnosis("driver", lambda s, n=opening: fewest(s, "openings", "connections") >= n)
