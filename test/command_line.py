@@ -1,4 +1,4 @@
-"""Run `uwb-mitigation`, or `python -m benchmarks paper`, in the process of the test, which saves a second of imports.
+"""Run `uwb-mitigation`, or `python -m benchmarks` (`paper` and `emulate-board`), in the process of the test, which saves a second of imports.
 
 Each command also has at least one test that starts a process (`start`).
 """
@@ -21,6 +21,8 @@ from uwb_mitigation.commands.support import console
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parent.parent), "COLUMNS": "160"}
 """Environment of a command in its own process: the package of this repository, and the terminal width."""
+
+OF_BENCHMARKS = ("paper", "emulate-board")
 
 
 class Finished(NamedTuple):
@@ -46,7 +48,7 @@ def run(words: str, *arguments: object, folder: Path, columns: int = 160) -> Fin
     ):
         os.chdir(folder)
         try:
-            (benchmarks.cli.main if words.startswith("paper") else cli.main)()
+            (benchmarks.cli.main if words.startswith(OF_BENCHMARKS) else cli.main)()
             code = 0
         except SystemExit as end:
             code = end.code or 0
@@ -78,5 +80,5 @@ def start(words: str, *arguments: object, folder: Path) -> Finished:
 
 def command(words: str, *arguments: object) -> list[str]:
     """Return the command line; see `run`."""
-    module = "benchmarks" if words.startswith("paper") else "uwb_mitigation.commands.cli"
+    module = "benchmarks" if words.startswith(OF_BENCHMARKS) else "uwb_mitigation.commands.cli"
     return [sys.executable, "-m", module, *shlex.split(words), *map(str, arguments)]

@@ -55,12 +55,12 @@ class Ekf:
         """
         if sensor not in self._parameters:
             return
-        rows, columns = self._selection(sensor, tuple(values))
+        rows, columns, square = self._selection(sensor, tuple(values))
         self.predict(time_s)
-        z, R = np.array(list(values.values()))[columns], R[np.ix_(columns, columns)]
+        z = np.array(list(values.values()))[columns]
         # H selects rows of the state.
         covariance = self.P[rows]
-        K = np.linalg.solve(covariance[:, rows] + R, covariance).T
+        K = np.linalg.solve(covariance[:, rows] + R[square], covariance).T
         self.x = self.x + K @ (z - self.x[rows])
         self.P = self.P - K @ covariance
 
@@ -71,23 +71,22 @@ class Ekf:
         self.time_s = time_s if self.time_s is None else max(time_s, self.time_s)
 
     @cache  # noqa: B019
-    def _selection(self, sensor: str, measured: tuple[int, ...]) -> tuple[list[int], list[int]]:
-        """Return the rows of the state that the configuration selects, and their places in the measured values."""
+    def _selection(
+        self, sensor: str, measured: tuple[int, ...]
+    ) -> tuple[list[int], list[int], tuple[Any, ...]]:
+        """Return the rows of the state that the configuration selects, their places in the values, and in a covariance."""
         config = self._parameters[f"{sensor}_config"]
         assert len(config) == 15
         rows = [row for row, selected in enumerate(np.take(config, PLANAR)) if selected]
         assert sum(config) == len(rows), "values that are not in the plane"
         assert set(rows) <= set(measured), f"{sensor} does not measure all selected values"
         columns = [column for column, row in enumerate(measured) if row in rows]
-        return [measured[column] for column in columns], columns
+        return [measured[column] for column in columns], columns, np.ix_(columns, columns)
 
     def _predict(self, dt: float) -> None:
         cosine, sine = math.cos(self.x[YAW]) * dt, math.sin(self.x[YAW]) * dt
-        F, half = np.eye(8), 0.5 * dt
-        F[:2, [VX, VY, AX, AY]] = (
-            (cosine, -sine, cosine * half, -sine * half),
-            (sine, cosine, sine * half, cosine * half),
-        )
+        F, turned = np.eye(8), np.array(((cosine, -sine), (sine, cosine)))
+        F[:2, VX : VY + 1], F[:2, AX : AY + 1] = turned, 0.5 * dt * turned
         F[YAW, VYAW] = F[VX, AX] = F[VY, AY] = dt
         before, self.x = self.x, F @ self.x
         # The Jacobian: the step turns with the yaw.

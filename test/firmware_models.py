@@ -116,6 +116,6 @@ def exported(shape: tuple[int, int, int], folder: Path) -> tuple[Int8Weights, Ne
         weights = random_networks.mlp(samples)
     write_model(folder, weights)
     subject = network_of(weights, None, MODEL_ID, graph.int8_model(weights))
-    count = 250 if shape in PUBLISHED else 100
+    count = 120 if shape in PUBLISHED else 60
     windows = random_networks.rounding_windows(samples, weights.activation_scale["input"], count)
     return weights, subject, windows

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import typer
+from bag_material import Foreign
 from command_line import run, succeed
 from rich.console import Console
 
@@ -84,6 +85,17 @@ def test_help_fits_80_columns_and_needs_no_checkout(words: tuple[str, ...], tmp_
         (["data", "simulate", "-o", "x.mcap", "--ranges", "0"], "0 ranges (1 or more"),
         (["data", "info", "x.mcap", "--json", "/absent/x.json"], "its folder does not exist"),
         *((["data", "info", "x.mcap", "--json", folder], "is a folder") for folder in ("/", ".")),
+        *(
+            (["emulate-board", *option.split()], option.split()[0].removeprefix("--"))
+            for option in (
+                "--mode neither",
+                "--rate 0",
+                "--duration -1",
+                "--lose nan",
+                "--seed -1",
+                "--link /no/board",
+            )
+        ),
     ],
 )
 def test_wrong_usage_has_one_line_and_one_exit_code(words: list[str], message: str, tmp_path: Path):
@@ -92,3 +104,14 @@ def test_wrong_usage_has_one_line_and_one_exit_code(words: list[str], message: s
     (line,) = done.stderr.splitlines()
     assert message in line
     assert done.stdout == ""
+
+
+def test_emulated_board_runs_for_the_given_duration_if_its_recording_is_not_empty(tmp_path: Path):
+    done = succeed("emulate-board --duration 0.5 --rate 100 --json board.json", folder=tmp_path)
+    assert "simulated" in done.stdout
+    assert "/dev/" in done.stdout
+    assert json.loads((tmp_path / "board.json").read_text())["sent"] > 0
+    bag = Foreign(tmp_path / "empty.mcap").ours().finish()
+    refused = run("emulate-board --duration 1", bag, folder=tmp_path)
+    assert "no measurements" in refused.stderr
+    assert "/dev/" not in refused.stdout, "before a port is opened"

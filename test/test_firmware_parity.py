@@ -72,7 +72,7 @@ def test_overflowing_prediction_is_a_model_error_as_in_the_mitigator(sign: int, 
 
 def build_program(name: str, export: Path, flags: Sequence[str] = ()) -> str:
     """Compile a program of `firmware/test/` with the model in `export`."""
-    sources = firmware_models.BOARD if name == "fuzz_link" else CORRECTION
+    sources = {"fuzz_link": firmware_models.BOARD, "fuzz_radio": "uwb_[dt]*.c"}.get(name, CORRECTION)
     return str(link(firmware_folder() / "test" / f"{name}.c", export, export / name, flags, sources))
 
 
@@ -108,6 +108,13 @@ def test_arbitrary_cirs_pass_the_sanitizers(scaling: Scaling, tmp_path: Path):
 def test_arbitrary_bytes_to_a_board_pass_the_sanitizers(tmp_path: Path):
     firmware_models.write_model(tmp_path, random_networks.remnet(16, 3))
     run_tool([build_program("fuzz_link", tmp_path, ADDRESS_SANITIZED), "1000", "1"])
+
+
+def test_arbitrary_frames_and_registers_of_a_radio_yield_no_false_range(tmp_path: Path):
+    words = run_tool([build_program("fuzz_radio", tmp_path, ADDRESS_SANITIZED), "300", "1"]).split()
+    ranged, refused = (int(words[position]) for position in (0, 2))
+    assert ranged > 1000
+    assert refused > 5000
 
 
 @pytest.mark.skipif(shutil.which("cmake") is None, reason="no CMake: apt install cmake")

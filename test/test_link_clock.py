@@ -127,17 +127,18 @@ def test_same_ticks_give_the_same_stamp_after_the_estimate_has_moved():
     assert clock.stamp(link.ticks(2.0), link.ns(2.07)) == first
 
 
-@pytest.mark.parametrize("step_s", [-3600, 3600])
-def test_step_of_the_host_clock_is_followed(step_s):
+@pytest.mark.parametrize("step_s", [-3600, 3600, 0.005])
+def test_step_of_the_host_clock_is_followed_and_increases_the_uncertainty(step_s):
     clock = DeviceClock()
     for step in range(50):
         time_ns = EPOCH + step * SECOND // 10
         clock.exchange(time_ns, step * 100_000 + 100, step * 100_000 + 100, time_ns + 200_000)
         clock.stamp(step * 100_000, time_ns)
 
-    time_ns = EPOCH + 5 * SECOND + step_s * SECOND
+    before_ns, time_ns = clock.uncertainty_ns, EPOCH + 5 * SECOND + round(step_s * SECOND)
     clock.exchange(time_ns, 5_000_100, 5_000_100, time_ns + 200_000)
 
+    assert before_ns < 0.5e6 < 2e6 < clock.uncertainty_ns
     assert clock.stamp(5_010_000, time_ns + 20_000_000) == pytest.approx(time_ns + 10_000_000, abs=1e6)
 
 

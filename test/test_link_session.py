@@ -93,17 +93,6 @@ def test_messages_before_hello_are_counted_and_a_request_connects():
     assert (bench.session.hello.firmware_name, bench.session.hello.window) == ("simulated", 157)
 
 
-@pytest.mark.parametrize(("mode", "kind"), [(Mode.HOST, RangeMeasurement), (Mode.DEVICE, Correction)])
-def test_each_mode_sends_its_messages_which_get_stamps_of_the_nodes_clock(mode, kind):
-    bench = connected(mode=mode)
-    took_place = EPOCH + bench.now
-
-    (event,) = bench.measure(5, late_ns=30 * MS)
-
-    assert (type(event), event.sequence) == (kind, 5)
-    assert event.stamp_ns == pytest.approx(took_place, abs=0.1 * MS)
-
-
 def test_lost_request_for_a_mode_is_repeated():
     bench = connected()
     bench.session.set_mode(Mode.DEVICE)

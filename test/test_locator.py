@@ -215,15 +215,6 @@ def test_absent_mitigator_and_a_second_locator_are_reported(ros: Ros, anchors: P
     ros.diagnosis("locator", lambda status: "another node publishes /uwb/pose" in status.message)
 
 
-def test_missing_anchors_file_is_reported_by_the_node(ros: Ros, tmp_path: Path):
-    excerpt = "no such file"
-    locator = ros.start("locator", f"anchors:={tmp_path / 'anchors.yaml'}")
-    locator.wait_for_output(excerpt)
-    ros.diagnosis("locator", lambda status: excerpt in status.message)
-    assert locator.exit_code() is None
-    assert locator.signal(signal.SIGINT) == 0
-
-
 def test_best_effort_height_is_received_and_best_effort_ranges_are_reported(ros: Ros, anchors: Path):
     heights = ros.node.create_publisher(PoseWithCovarianceStamped, "/height", qos_profile_sensor_data)
     ros.node.create_publisher(RangeCorrected, CORRECTED, qos_profile_sensor_data)
@@ -287,11 +278,21 @@ def test_tf_contains_only_the_frames_of_the_tags_below_the_map(ros: Ros, anchors
     ros.spin_until(lambda: any(frame == "uwb_tag" and stamp < half_ns for frame, stamp in links()))
 
 
-@pytest.mark.parametrize("frame", ["tag_9", "map"])
-def test_tag_frame_in_use_is_refused(ros: Ros, anchors: Path, frame: str):
-    locator = ros.start("locator", f"anchors:={anchors}", f"tag_frame:={frame}", "tag:=7")
-    locator.wait_for_output(f"tag_frame = '{frame}'")
-    assert locator.exit_code() is None
+@pytest.mark.parametrize(
+    ("parameter", "excerpt"),
+    [
+        ("tag_frame:=tag_9", "tag_frame = 'tag_9'"),
+        ("tag_frame:=map", "tag_frame = 'map'"),
+        ("anchors:=no.yaml", "no such file"),
+    ],
+)
+def test_tag_frame_in_use_and_missing_anchors_are_reported(
+    ros: Ros, anchors: Path, parameter: str, excerpt: str
+):
+    locator = ros.start("locator", f"anchors:={anchors}", "tag:=7", parameter)
+    locator.wait_for_output(excerpt)
+    ros.diagnosis("locator", lambda status: excerpt in status.message)
+    assert locator.signal(signal.SIGINT) == 0
 
 
 def test_pipeline_contains_a_locator_if_anchors_are_given(ros: Ros, tmp_path: Path):

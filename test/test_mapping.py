@@ -137,53 +137,6 @@ def test_a_matrix_needs_names_for_its_columns(tmp_path: Path):
         read(document, tmp_path / "x.mat")
 
 
-@pytest.mark.parametrize(
-    ("form", "text", "samples"),
-    [
-        ("magnitude", "[3, 4]", [3, 4]),
-        ("complex", "[(3-1j); 4+2i]", [3, -1, 4, 2]),
-        ("complex", "[[3, -1], [4, 2]]", [3, -1, 4, 2]),
-        ("complex", "[3+0j, 4+0j]", [3, 0, 4, 0]),
-        ("interleaved", "3 -1 4 2", [3, -1, 4, 2]),
-    ],
-)
-def test_cirs_in_text_keep_their_values(form: str, text: str, samples: list[int], tmp_path: Path):
-    source = of(f't,a,r,c\n0,1,2,"{text}"\n', tmp_path / "x.csv", cir={"column": "c", "samples": form})
-    assert cirs_of(source) == [samples]
-    expected = Encoding.MAGNITUDE if form == "magnitude" else Encoding.COMPLEX_INT16
-    assert next(iter(source)).measurement.cir.encoding == expected
-
-
-def test_real_and_imaginary_parts_in_two_columns_are_complex_samples(tmp_path: Path):
-    cir = {"column": "i", "imaginary": "q"}
-    assert cirs_of(of('t,a,r,i,q\n0,1,2,"3 4","-1 2"\n', tmp_path / "x.csv", cir=cir)) == [[3, -1, 4, 2]]
-    series = {"column": "i{0..1}", "imaginary": "q{0..1}"}
-    source = of("t,a,r,i0,i1,q0,q1\n0,1,2,3,4,-1,2\n", tmp_path / "y.csv", cir=series)
-    assert cirs_of(source) == [[3, -1, 4, 2]]
-    with pytest.raises(RecordingError, match="row 1: 2 real and 3 imaginary parts"):
-        of('t,a,r,i,q\n0,1,2,"3 4","-1 2 5"\n', tmp_path / "z.csv", cir=cir)
-    with pytest.raises(ValueError, match="imaginary without samples"):
-        of("t,a,r,i,q\n", tmp_path / "z.csv", cir=cir | {"samples": "complex"})
-
-
-def test_first_paths_outside_of_the_cirs_are_a_warning(tmp_path: Path):
-    text = "t,a,r,f,c\n" + "".join(f'{n},1,2,{f},"3 4 5"\n' for n, f in enumerate((2.9, 3, 740.5)))
-    fields = PLAIN["fields"] | {"first_path_index": "f"}
-    source = of(text, tmp_path / "x.csv", fields=fields, cir={"column": "c"})
-    (warning,) = [text for text in source.warnings if "first path" in text]
-    assert warning.startswith("2 of 3 first paths are outside of their CIRs, such as 3.00 of 3 samples")
-    assert "or with sum: {INDEX: 1, START: -1}" in warning
-    starts = (
-        text.replace("r,f", "r,s,f")
-        .replace(",2,2.9", ",2,1,2.9")
-        .replace(",2,3", ",2,2,3")
-        .replace(",2,740", ",2,739,740")
-    )
-    fields = PLAIN["fields"] | {"first_path_index": {"sum": {"f": 1, "s": -1}}}
-    source = of(starts, tmp_path / "y.csv", fields=fields, cir={"column": "c"})
-    assert [record.measurement.cir.first_path_index for record in source] == pytest.approx([1.9, 1.0, 1.5])
-
-
 def test_real_parts_alone_are_no_complex_samples():
     with pytest.raises(RecordingError, match=r"real numbers instead of complex ones.*cir\.imaginary"):
         read_cir([3.0, 4.0, 5.0], "complex")
@@ -390,6 +343,7 @@ def summary(source: MappedRecording) -> dict[str, Any]:
         "position": first.tag_position and rounded(*first.tag_position),
         "anchors": [rounded(*one.position) for one in source.anchors.anchors] if has_anchors else [],
         "levels": [rounded(cir.rx_power_dbm, cir.first_path_power_dbm) for cir in cirs],
+        "cirs": [(cir.encoding, *cir.samples.tolist()) for cir in cirs],
         "cir": (len(cirs[0]), cirs[0].channel, cirs[0].preamble_count, *rounded(cirs[0].first_path_index)),
         "dropped": source.dropped,
         "warnings": source.warnings,
@@ -513,6 +467,14 @@ def test_the_real_labyrinth_is_imported_with_its_odometry(tmp_path: Path):
 
 # Values, errors and warnings -------------------------------------------------------------------------------------
 
+
+def with_text(cir: str, samples: str) -> tuple[str, dict[str, Any]]:
+    """Return a range with the text of a CIR, and its mapping."""
+    return f't,a,r,c\n0,1,2,"{cir}"\n', {"cir": {"column": "c", "samples": samples}}
+
+
+PARTS = {"column": "i", "imaginary": "q"}
+IN_PAIRS = {"cirs": [(Encoding.COMPLEX_INT16, 3, -1, 4, 2)]}
 IDS = 't,a,r,pair,room\n0,0xdeca,2,"(11, 2)",hall\n1,de:ca,3,"(10, 5)",lab\n2,7,3,"(10, 5)",hall\n'
 TAG, ANCHOR = ({"column": "pair", "pattern": pattern} for pattern in (r"\((\d+),", r", (\d+)\)"))
 HOUR_EARLIER = {"column": "t", "unit": "iso8601", "offset": -3600}
@@ -576,6 +538,23 @@ MESSAGE = {
         (
             BOOT, {"fields": MESSAGE | {name: MESSAGE[name] | {"optional": True} for name in ("anchor", "range")}},
             {"ranges": [2.5, 2.6]},
+        ),
+        (*with_text("[3, 4]", "magnitude"), {"cirs": [(Encoding.MAGNITUDE, 3, 4)]}),
+        (*with_text("[3+0j, 4+0j]", "complex"), {"cirs": [(Encoding.COMPLEX_INT16, 3, 0, 4, 0)]}),
+        *((*with_text(cir, "complex"), IN_PAIRS) for cir in ("[(3-1j); 4+2i]", "[[3, -1], [4, 2]]")),
+        (*with_text("3 -1 4 2", "interleaved"), IN_PAIRS),
+        ('t,a,r,i,q\n0,1,2,"3 4","-1 2"\n', {"cir": PARTS}, IN_PAIRS),
+        ("t,a,r,i0,i1,q0,q1\n0,1,2,3,4,-1,2\n", {"cir": {name: f"{one}{{0..1}}" for name, one in PARTS.items()}}, IN_PAIRS),
+        (
+            "t,a,r,f,c\n" + "".join(f'{n},1,2,{f},"3 4 5"\n' for n, f in enumerate((2.9, 3, 740.5))),
+            with_fields(first_path_index="f") | {"cir": {"column": "c"}},
+            {"warnings": ["2 of 3 first paths are outside of their CIRs, such as 3.00 of 3 samples: if these are windows, set "
+                          "first_path_index with offset: -START, the index of their first sample, or with sum: {INDEX: 1, START: -1}, two columns"]},
+        ),
+        (
+            't,a,r,f,s,c\n0,1,2,740.5,739,"3 4 5"\n',
+            with_fields(first_path_index={"sum": {"f": 1, "s": -1}}) | {"cir": {"column": "c"}},
+            {"cir": (3, 0, 0, 1.5), "warnings": []},
         ),
         # Placements may be minutes apart.
         ("t,a,r\n" + "".join(f"{100 * n},1,2\n" for n in range(50)), {"moving": False}, {"ranges": [2.0] * 50}),
@@ -678,6 +657,10 @@ def test_all_files_do_not_contain_the_mapping(tmp_path: Path):
             "odometry.stamp: unit 'm'; valid: ns, us",
         ),
         ("fields: {anchor: {column: a, pattern: '(('}, range: r}", "not a regular expression"),
+        (
+            "fields: {anchor: a, range: r}\ncir: {column: i, imaginary: q, samples: complex}",
+            "imaginary without samples",
+        ),
         ("fields: {anchor: {column: a, pattern: 'a'}, range: r}", "has no group"),
         ("fields: {anchor: a, range: r}\ndrop: [{column: a}]", "drop.0: a rule needs equals"),
         ("fields: !!python/object/apply:os.system ['true']", "not YAML"),

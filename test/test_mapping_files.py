@@ -16,7 +16,19 @@ import yaml
 from command_line import succeed
 from pydantic import ValidationError
 from scipy.io import savemat
-from test_mapping import BOOT, MESSAGE, PLAIN, cirs_of, of, ranges_of, read, values_of, with_fields, write
+from test_mapping import (
+    BOOT,
+    MESSAGE,
+    PARTS,
+    PLAIN,
+    cirs_of,
+    of,
+    ranges_of,
+    read,
+    values_of,
+    with_fields,
+    write,
+)
 
 from uwb_mitigation.commands.support.mapped_report import models_of
 from uwb_mitigation.errors import DamagedRecordingError, MissingDependencyError, RecordingError
@@ -134,6 +146,7 @@ def test_repeated_headers_and_merged_rows_are_dropped_and_keep_the_row_numbers(t
         (every(100_000), {}, "unit: us"),
         (every(100_000), in_unit("ms"), "unit: us"),
         (every(1 / 864_000), {}, r"unit: s, scale: 86400 \(days\)"),
+        ('t,a,r,i,q\n0,1,2,"3 4","-1 2 5"\n', {"cir": PARTS}, "row 1: 2 real and 3 imaginary parts"),
         (with_cir(round(40 + 30 / (1 + n), 2) for n in range(200)), AMPLITUDES, "row 1: a CIR in dB"),
         (with_cir((-1) ** n * 40 for n in range(200)), AMPLITUDES, "row 1: negative magnitudes .*interleaved, or complex.*cir.imaginary"),
     ],

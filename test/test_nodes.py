@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import shutil
 import signal
 import sys
@@ -87,32 +88,31 @@ def test_nodes_equal_the_library_on_a_real_log(ros: Ros, apartment: Path):
     assert {m.model_id for m in corrected} == {mitigation.bundle.model_id}
 
 
-@pytest.mark.parametrize(
-    ("step", "error", "code"),
-    [
-        ("driver.Driver.__init__", "RuntimeError", CRASHED),
-        ("driver.Driver.create_lifecycle_publisher", "rcl.RCLError", CRASHED),
-        ("publishing.prepare_encoders", "OSError", CRASHED),
-        ("publishing.prepare_encoders", "RuntimeError", REFUSED),
-    ],
-)
 def test_only_errors_of_ros_and_the_system_at_the_start_are_crashes_and_no_empty_bag_remains(
-    ros: Ros, step: str, error: str, code: int, tmp_path: Path
+    ros: Ros, tmp_path: Path
 ):
     program = (
+        "import sys\n"
+        "from unittest import mock\n"
         "from rclpy.impl.implementation_singleton import rclpy_implementation as rcl\n"
-        "from uwb_mitigation.nodes import driver\n"
-        "from uwb_mitigation.nodes.feeds import publishing\n"
         "from uwb_mitigation.nodes.support import spinning\n"
-        "def fail(*arguments, **options):\n"
-        f"    raise {error}('failed to create publisher')\n"
-        f"{step} = fail\n"
-        "spinning.run_node('driver')\n"
+        "for step, error in (\n"
+        "    ('driver.Driver.__init__', RuntimeError), ('driver.Driver.create_lifecycle_publisher', rcl.RCLError),\n"
+        "    ('feeds.publishing.prepare_encoders', OSError), ('feeds.publishing.prepare_encoders', RuntimeError),\n"
+        "):\n"
+        "    failing = error(f'{step} fails')\n"
+        "    try:\n"
+        "        with mock.patch(f'uwb_mitigation.nodes.{step}', side_effect=failing):\n"
+        "            spinning.run_node('driver')\n"
+        "    except SystemExit as end:\n"
+        "        print(f'{step} fails, exit code {end.code}', file=sys.stderr)\n"
     )
     record = f"record:={tmp_path}/live.mcap"
     driver = ros.run([sys.executable, "-c", program, "--ros-args", "-p", record])
-    assert driver.wait() == code
-    assert "failed to create publisher" in driver.output
+    assert driver.wait() == 0
+    assert re.findall(r"fails, exit code (\d+)", driver.output) == list(map(str, [CRASHED] * 3 + [REFUSED]))
+    for step in ("__init__", "create_lifecycle_publisher", "prepare_encoders"):
+        assert f"{step} fails\n" in driver.output
     assert not list(tmp_path.glob("live*"))
 
 

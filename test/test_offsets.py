@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from model_material import bundle, measurement
 
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.mitigation.correction import Mitigation
-from uwb_mitigation.mitigation.model.architecture import Remnet
-from uwb_mitigation.types.measurement import Status
 from uwb_mitigation.types.offsets import (
     MAX_ENTRIES,
     MAX_OFFSET_M,
@@ -115,42 +109,3 @@ def test_largest_offsets_and_standard_deviations_are_accepted_and_compared():
     assert small == Offsets(0.1)
     assert small != large
     assert large != small
-
-
-@pytest.fixture(scope="module")
-def subject(tmp_path_factory) -> Mitigation:
-    return Mitigation(bundle(tmp_path_factory.mktemp("bundle"), Remnet(samples=157)))
-
-
-def test_offset_is_subtracted_in_addition_to_the_predicted_error(subject: Mitigation):
-    offset = 0.25
-    plain, moved = subject.correct([measurement(3.0)])[0], measurement(3.25)
-    result = Mitigation(subject.bundle, Offsets(offset)).correct([moved])[0]
-    assert result.status is Status.OK
-    assert result.range_raw_m == 3.25
-    assert result.correction_m == pytest.approx(plain.correction_m + offset, abs=1e-6)
-    assert result.range_m == np.float32(3.25) - np.float32(result.correction_m)
-    assert result.range_m == pytest.approx(plain.range_m, abs=1e-6)
-    assert result.variance_m2 == plain.variance_m2
-
-
-@pytest.mark.parametrize(
-    ("range_m", "offset", "expected", "valid"),
-    [
-        (3.0, 0.5, 2.5, True),
-        (0.25, 0.5, -0.25, False),
-        (-0.25, -0.5, 0.25, True),
-        (math.nan, 0.5, math.nan, False),
-    ],
-)
-def test_passed_through_range_has_the_offset_subtracted(
-    subject: Mitigation, range_m: float, offset: float, expected: float, valid: bool
-):
-    bad = measurement(range_m)
-    bad = replace(bad, cir=replace(bad.cir, preamble_count=0))
-    result = Mitigation(subject.bundle, Offsets(offset)).correct([bad])[0]
-    assert result.status is Status.BAD_CIR
-    assert str(result.range_m) == str(expected)
-    assert result.correction_m == offset
-    assert str(result.range_raw_m) == str(range_m)
-    assert math.isfinite(result.variance_m2) is valid

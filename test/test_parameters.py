@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import signal
+import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -54,30 +55,41 @@ def test_invalid_value_is_refused_with_range(replaying: Ros, name: str, value: o
 
 
 QOS = "-p qos_overrides./uwb/range_raw.subscription"
+REFUSED = {
+    "driver -p sorce:=mcap": "unknown parameter 'sorce'; did you mean 'source'?",
+    "pipeline -p raet:=2.0": "unknown parameter 'raet'; did you mean 'rate'",
+    "mitigator -p wholly_else:=1": "unknown parameter 'wholly_else' (",
+    f"mitigator {QOS}.reliability:=perhaps": "qos_overrides of /uwb/range_raw",
+    f"mitigator {QOS}.depth:=deep": "qos_overrides of /uwb/range_raw",
+    "driver -p source:=mcap -p path:=/nonexistent/bag.mcap": "/nonexistent/bag.mcap",
+    "driver -p rate:=.nan": "rate",
+    "driver -p source:=topic -p map:=string_json -p topic:=bad--x": "bad--x",
+    f"driver -r __node:={'a' * 300}": "node name length should not exceed",
+    f"driver -r __ns:=/{'a' * 300}": "invalid node namespace",
+    f"driver -r uwb/range_raw:={'a' * 300}": "topic length should not exceed",
+}
 
 
-@pytest.mark.parametrize(
-    ("words", "excerpt"),
-    [
-        ("driver -p sorce:=mcap", "unknown parameter 'sorce'; did you mean 'source'?"),
-        ("pipeline -p raet:=2.0", "unknown parameter 'raet'; did you mean 'rate'"),
-        ("mitigator -p wholly_else:=1", "unknown parameter 'wholly_else' ("),
-        (f"mitigator {QOS}.reliability:=perhaps", "qos_overrides of /uwb/range_raw"),
-        (f"mitigator {QOS}.depth:=deep", "qos_overrides of /uwb/range_raw"),
-        ("driver -p source:=mcap -p path:=/nonexistent/bag.mcap", "/nonexistent/bag.mcap"),
-        ("driver -p rate:=.nan", "rate"),
-        ("driver -p source:=topic -p map:=string_json -p topic:=bad--x", "bad--x"),
-        (f"driver -r __node:={'a' * 300}", "node name length should not exceed"),
-        (f"driver -r __ns:=/{'a' * 300}", "invalid node namespace"),
-        (f"driver -r uwb/range_raw:={'a' * 300}", "topic length should not exceed"),
-    ],
-)
-def test_node_refuses_a_parameter_at_its_start(ros: Ros, words: str, excerpt: str):
-    node, *arguments = words.split()
-    process = ros.start(node, arguments=arguments)
-    assert process.wait() == 1
-    assert excerpt in process.output
+def test_nodes_refuse_parameters_at_their_start(ros: Ros):
+    # One process after the other would import the same libraries.
+    program = (
+        "import sys\n"
+        "from uwb_mitigation.nodes.support.spinning import run_node\n"
+        f"for words in {list(REFUSED)}:\n"
+        "    node, *arguments = words.split()\n"
+        "    sys.argv = [node, '--ros-args', *arguments]\n"
+        "    try:\n"
+        "        run_node(node)\n"
+        "    except SystemExit as end:\n"
+        "        print('exit code', end.code, file=sys.stderr)\n"
+    )
+    process = ros.run([sys.executable, "-c", program])
+    assert process.wait() == 0
+    *outputs, rest = process.output.split("exit code 1\n")
+    assert rest == ""
     assert "Traceback" not in process.output
+    pairs = zip(REFUSED.values(), outputs, strict=True)
+    assert [(excerpt, output) for excerpt, output in pairs if excerpt not in output] == []
 
 
 def test_parameters_of_other_nodes_in_a_shared_file_are_logged_in_one_line(ros: Ros, tmp_path: Path):

@@ -17,13 +17,11 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from model_material import bundle
 from rclpy.qos import qos_profile_sensor_data
-from rclpy.serialization import deserialize_message
 from ros_harness import PAUSED, Ros, stamped_after
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Range
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
-from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.nodes.support import diagnostics
@@ -51,25 +49,6 @@ def test_killed_node_leaves_the_other_running_and_a_new_one_joins(ros: Ros):
         nodes[killed] = ros.start(killed, *(ENDLESS if killed == "driver" else ()))
         ros.spin_until(lambda since=killed_ns: len(stamped_after(corrected, since)) > 20)
         assert [node.exit_code() for node in nodes.values()] == [None, None]
-
-
-@pytest.mark.ros
-def test_queued_ranges_are_corrected_in_order_and_bit_identical(ros: Ros):
-    mitigation = Mitigation(load_bundle(default_model_path()))
-    measurements = [record.measurement for record in SimulatedSource(seed=2, count=300)]
-    corrected = ros.collect(RangeCorrected, CORRECTED)
-    mitigator = ros.start("mitigator")
-    publisher = ros.node.create_publisher(RangeCir, RAW, 1000)
-    ros.find_each_other(publisher, deserialize_message(encode_range(measurements[0]), RangeCir), corrected)
-    # While it is stopped, all ranges wait in its queue.
-    mitigator.send(signal.SIGSTOP)
-    for measurement in measurements:
-        publisher.publish(encode_range(measurement))
-    mitigator.send(signal.SIGCONT)
-    ros.spin_until(lambda: len(corrected) == len(measurements))
-    assert [m.sequence for m in corrected] == [m.sequence for m in measurements]
-    expected = [np.float32(mitigation.correct([m])[0].range_m) for m in measurements]
-    assert np.array_equal([m.range for m in corrected], expected, equal_nan=True)
 
 
 @pytest.mark.ros

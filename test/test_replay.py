@@ -54,18 +54,19 @@ SILENT = SimpleNamespace(info=lambda text: None, warning=lambda text, **_: None)
 
 
 class ListSource:
-    """Records at given times, numbered from 0; it may be slow or end with an error."""
+    """Records at given times, numbered from 0; it may end with an error. It calls `before` before each."""
 
     name = "list"
     simulated = True
 
-    def __init__(self, stamps_ns: Sequence[int], error: Exception | None = None, slow_s: float = 0.0) -> None:
-        self.stamps_ns, self.error, self.slow_s = stamps_ns, error, slow_s
+    def __init__(self, stamps_ns: Sequence[int], error: Exception | None = None) -> None:
+        self.stamps_ns, self.error = stamps_ns, error
         self.skipped: Counter[str] = Counter()
+        self.before = lambda index: None
 
     def __iter__(self) -> Iterator[Record]:
         for index, stamp_ns in enumerate(self.stamps_ns):
-            time.sleep(self.slow_s)
+            self.before(index)
             yield Record(RangeMeasurement(stamp_ns, 1, 2, index, 0, 1.0, Cir(np.zeros(0, np.int16))))
         if self.error is not None:
             raise self.error
@@ -174,7 +175,10 @@ class CountedTime:
     time_ns = 0
 
     def now_ns(self) -> int:
-        self.time_ns += MS
+        return self.advance(MS)
+
+    def advance(self, by_ns: int) -> int:
+        self.time_ns += by_ns
         return self.time_ns
 
     def stamp_ns(self, replay_ns: int) -> int:
@@ -246,7 +250,11 @@ def test_interruption_between_two_clock_readings_is_no_clock_step(monkeypatch: p
 
 
 def test_source_that_cannot_keep_its_rate_is_reported():
-    player = Player(ListSource([each * 1000 for each in range(120)], slow_s=0.005)).play()
+    source, clock = ListSource([each * 1000 for each in range(120)]), CountedTime()
+    source.before = lambda index: clock.advance(5 * MS)
+    player = Player(source)
+    player.feed._clock = clock
+    player.play()
     _, level, text, values = player.feed.describe()
     assert float(values["behind s"]) > 0.5
     assert level > b"\0"
@@ -321,7 +329,10 @@ def test_new_rate_changes_the_later_intervals():
 def test_late_records_are_published_in_batches_and_in_order():
     second_ns = 10**18 + 10**9
     source = ListSource([10**18, *range(second_ns, second_ns + 499_000, 1000)])
-    player = Player(source, lambda player, sequence: time.sleep(1.1) if sequence == 0 else None).play()
+    clock = CountedTime()
+    player = Player(source, lambda player, sequence: clock.advance(1100 * MS) if sequence == 0 else None)
+    player.feed._clock = clock
+    player.play()
     assert player.sequences == list(range(500))
     assert max(player.batches) > 1
     # The second record is not due yet.
@@ -403,16 +414,12 @@ def test_respawned_driver_records_to_a_new_file_and_does_not_repeat_a_recording_
 
 
 def test_time_to_open_a_source_does_not_make_its_first_records_late():
-    opened_ns: list[int] = []
-
-    class SlowSource(ListSource):
-        def __iter__(self) -> Iterator[Record]:
-            time.sleep(0.3)
-            opened_ns.append(time.monotonic_ns())
-            yield from super().__iter__()
-
-    player = Player(SlowSource([0, 10 * MS, 20 * MS])).play()
-    assert player.stamps[0] >= opened_ns[0]
+    source, clock = ListSource([0, 10 * MS, 20 * MS]), CountedTime()
+    source.before = lambda index: index or clock.advance(300 * MS)
+    player = Player(source)
+    player.feed._clock = clock
+    player.play()
+    assert player.stamps[0] >= 300 * MS
     assert np.diff(player.stamps).tolist() == [10 * MS] * 2
 
 

@@ -118,6 +118,7 @@ def test_driver_counts_messages_that_do_not_fit_and_goes_on(ros: Ros):
     sender = ros.node.create_publisher(String, "/uwb/json", QoSProfile(depth=100))
     texts = ["{", '{"tag": 7}', '{"tag": -1, "ranges": [{"anchor": 1, "range_m": 4.5}]}']
     texts.append('{"tag": 7, "ranges": [{"anchor": 1, "range_m": 4.5}, {"anchor": 2, "range_m": null}]}')
+    texts.append('{"tag": 7, "ranges": [{"anchor": null, "range_m": 4.5}]}')
 
     def sent() -> bool:
         for text in texts:
@@ -127,7 +128,7 @@ def test_driver_counts_messages_that_do_not_fit_and_goes_on(ros: Ros):
     ros.spin_until(sent)
     assert {(message.tag_id, message.anchor_id, message.range) for message in received} == {(7, 1, 4.5)}
 
-    for reason in ("range is not a number", "message that cannot be used"):
+    for reason in ("range is not a number", "tag or anchor is unknown", "message that cannot be used"):
         ros.diagnosis("driver", lambda s, reason=reason: int(diagnostic_values(s).get(reason, 0)) > 2)
 
 
@@ -218,23 +219,6 @@ def test_standard_messages():
     assert Convert("string_at").take(String(data="tid:4,seq:1,range:[110]")) == [(4, 0, 1.1)]
     message = String(data='{"tag": 1, "ranges": [{"anchor": 2, "range_m": 3}]}')
     assert Convert("string_json").take(message) == [(1, 2, 3.0)]
-
-
-def test_lines_of_text_are_read_with_a_pattern():
-    distance = {"column": "r", "unit": "cm", "units": {30: "m"}}
-    fields = {"anchor": {"column": "a", "hex": True}, "range": distance}
-    document = {"name": "lines", "type": "std_msgs/msg/String", "topics": ["/log"], "fields": fields}
-    convert = Convert(Mapping.model_validate(document | {"pattern": r"from (?P<a>\w+): (?P<r>[\d.]+)"}))
-    assert convert.take(String(data="from 1D: 250; from 1E: 3.5")) == [(1, 29, 2.5), (1, 30, 3.5)]
-    assert len(convert.take(String(data="boot"))) == 2
-    assert not convert.ranges.counts
-
-
-def test_ranges_without_an_id_are_counted():
-    document = {"name": "x", "type": "std_msgs/msg/String", "topics": ["/log"], "text": "json"}
-    convert = Convert(Mapping.model_validate(document | {"fields": {"anchor": "a", "range": "r"}}))
-    assert convert.take(String(data='{"a": null, "r": 2.5}')) == []
-    assert convert.ranges.counts == {"tag or anchor is unknown": 1}
 
 
 def test_types_and_mappings_that_cannot_be_used_are_errors():

@@ -14,8 +14,8 @@ from bag_material import write_corrected
 from command_line import run, succeed
 from drives import HALL, NANOSECONDS, Robot, circuit, drive, wrapped
 
-from benchmarks.position_data import real_runs, simulated_runs
-from benchmarks.positions import WARM_UP_S, evaluate, locate, odometry_faults
+from benchmarks.position_data import real_runs
+from benchmarks.positions import evaluate, odometry_faults
 from uwb_mitigation.commands import positioning
 from uwb_mitigation.commands.offline.track import HoldoutErrors, held_out, worst_displaced
 from uwb_mitigation.nodes.support.parameter_tables import TABLES
@@ -25,7 +25,6 @@ from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.robust_update import CONSTANT_SD
 from uwb_mitigation.positioning.recorded_tracks import track_tag
-from uwb_mitigation.positioning.track_errors import track_errors
 from uwb_mitigation.recordings.bag.odometry import read_odometry
 from uwb_mitigation.recordings.bag.pose_paths import read_truth
 from uwb_mitigation.recordings.bag.writer import BagWriter
@@ -268,7 +267,7 @@ def displaced(ranges: Ranges, truth: TruePath, anchors: AnchorMap = HALL) -> lis
 
 
 def test_anchor_is_accused_only_if_another_position_explains_its_ranges():
-    ranges, truth = drive(seconds=60, rate_hz=10.0, seed=1)
+    ranges, truth = drive(seconds=40, rate_hz=10.0, seed=1)
     # The track without anchor 4 fits it worse than anchor 1, which is wrong.
     for row, shift in ((2, (1.5, -1.5, 0.0)), (0, (1.5, 1.5, 0.0))):
         wrong = HALL.position + (np.arange(len(HALL)) == row)[:, None] * shift
@@ -276,10 +275,14 @@ def test_anchor_is_accused_only_if_another_position_explains_its_ranges():
         off_m = np.subtract(fitted.position, HALL.position[row])
         assert fitted.id == row + 1
         assert np.abs(off_m).max() < 2.0 * fitted.sd < 0.5
+    noise_m = np.random.default_rng(2).normal(0.0, 0.4, len(ranges))
+    noisy = replace(ranges, range_m=ranges.range_m + noise_m)
+    (less_certain,) = displaced(noisy, truth, HALL.moved(wrong, HALL.sd))
+    assert less_certain.sd > 1.5 * fitted.sd
     assert displaced(ranges, truth) == []
     longer = ranges.range_m + 0.8 * (ranges.anchor == 2)
     assert displaced(replace(ranges, range_m=longer), truth) == []
-    late = (ranges.anchor == 2) & (ranges.stamp_ns > 30 * NANOSECONDS)
+    late = (ranges.anchor == 2) & (ranges.stamp_ns > 20 * NANOSECONDS)
     ranges.range_m[late] += np.random.default_rng(1).exponential(1.5, int(late.sum()))
     assert displaced(ranges, truth) == []
 
@@ -359,14 +362,6 @@ def test_real_drives_reach_the_documented_errors(hanyang: Path):
     assert max(entry["ratio_to_best_baseline"] for entry in entries) < 1.1
     assert np.mean([entry["rows"]["smoothed"]["rmse_m"] for entry in entries]) < 0.40
     assert np.mean([entry["rows"]["raw_least_squares"]["rmse_m"] for entry in entries]) > 2
-
-
-def test_corrected_ranges_improve_live_positions():
-    run = next(run for run in simulated_runs() if run.set_name == "flat" and run.arguments[0] == 8).read()
-    truth = run.truth.take(run.truth.stamp_ns >= run.ranges.stamp_ns[0] + round(WARM_UP_S * NANOSECONDS))
-    raw, corrected = (track_errors(locate(run, ranges), truth) for ranges in (run.ranges, run.corrected()))
-    assert corrected.rmse < 0.75 * raw.rmse
-    assert corrected.coverage95 > 0.95
 
 
 def test_recordings_that_cannot_be_read_are_reported_and_the_other_ones_continue(tmp_path: Path):

@@ -120,12 +120,17 @@ def uci_settings(value):
     return [settings.board for settings in read_settings(value)]
 
 
-def test_the_first_board_is_the_tag_of_the_others():
+def test_the_first_board_is_the_tag_of_the_others_also_at_another_computer():
     tag, anchor, second_anchor = uci_settings(driver_values(port="/dev/a,/dev/b,/dev/c", radio__rate=20.0))
     assert (tag.role, tag.address, tag.peers, tag.channel) == (Role.TAG, 1, (2, 3), 9)
     assert (second_anchor.role, second_anchor.address, second_anchor.peers) == (Role.ANCHOR, 3, (1,))
     assert tag.effective_interval_ms == anchor.effective_interval_ms == 100
     assert tag.session_id(3) == second_anchor.session_id(1)
+    (tag,) = uci_settings(driver_values(port="/dev/a"))
+    (anchor,) = uci_settings(driver_values(port="/dev/a", radio__role="anchor"))
+    assert tag.session_id(2) == anchor.session_id(1)
+    assert tag.effective_interval_ms == anchor.effective_interval_ms == 88
+    assert (anchor.address, anchor.peers) == (2, (1,))
 
 
 @pytest.mark.parametrize("anchors", [[3, 4], ["3", "0x4"], "3,4", "[3, 4]", array("q", [3, 4])])
@@ -134,11 +139,3 @@ def test_anchors_are_a_list_or_a_text(anchors: object):
     row.check(anchors)
     (tag,) = uci_settings(driver_values(port="/dev/a", radio__anchors=anchors))
     assert tag.peers == (3, 4)
-
-
-def test_boards_at_two_computers_have_matching_settings():
-    (tag,) = uci_settings(driver_values(port="/dev/a"))
-    (anchor,) = uci_settings(driver_values(port="/dev/a", radio__role="anchor"))
-    assert tag.session_id(2) == anchor.session_id(1)
-    assert tag.effective_interval_ms == anchor.effective_interval_ms == 88
-    assert (anchor.address, anchor.peers) == (2, (1,))

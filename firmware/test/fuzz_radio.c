@@ -254,7 +254,7 @@ static void read_register(fake_chip *chip, uint8_t file, size_t sub, uint8_t *in
         break;
     case 0x15:
         for (size_t i = 0; i < bytes; i++) {
-            in[i] = i < 5 ? (uint8_t)(chip->received_at >> 8 * i) : next_byte(chip);
+            in[i] = (uint8_t)(i < 5 ? chip->received_at >> 8 * i : next_byte(chip));
         }
         break;
     case 0x17:
