@@ -141,7 +141,9 @@ class AmbiguityCheck:
         variance = state.persisting_variance(redundancy)
         excess = FEW_ANCHORS * max(variance - state.modelled_variance, 0.0)
         constant = max(excess, state.constant_variance(rows))
-        filter_.unseen = self._widens * (constant * gain + state.hidden_offset_covariance())
+        filter_.unseen = np.zeros((6, 6))
+        unseen = filter_.unseen[:3, :3]
+        unseen[:] = self._widens * (constant * gain + state.hidden_offset_covariance())
         sd_m, scale = math.sqrt(max(FEW_ANCHORS * variance, RANGE_ERROR_M**2)), state.covariance_scale()
         self.error_sd_m = sd_m
         offset_sd_m = math.sqrt(float(state.P[OFFSET, OFFSET]))
@@ -167,7 +169,7 @@ class AmbiguityCheck:
         if dims == 3 and abs(symmetry.axis[2]) > LEVEL and math.hypot(*images[0, :2]) < same_m:
             self._is_side_known = not is_possible[0]
             images, weight = images[is_possible], np.exp(-0.5 * separations[is_possible] ** 2)
-            filter_.unseen += self._widens * (images.T @ images) / (len(images) + 1)
+            unseen += self._widens * (images.T @ images) / (len(images) + 1)
             self.shift[:2] = (weight @ images)[:2] / (1.0 + weight.sum())
             if len(images):
                 is_apart = is_possible[0] and separations[0] < separations[1]
@@ -191,7 +193,7 @@ class AmbiguityCheck:
             is_inside = np.append(True, is_possible)
             is_arc = np.count_nonzero(is_inside != np.roll(is_inside, 1)) == 2
             spread = images.T @ images / (len(images) + 1)
-            filter_.unseen += self._widens * spread
+            filter_.unseen[:3, :3] += self._widens * spread
             is_short = np.trace(spread[:2, :2]) < _MAX_ARC_M**2
             self.ambiguity = Ambiguity.ARC if is_arc and is_short else Ambiguity.CIRCLE
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from itertools import repeat
-from operator import add, mul
 from typing import NamedTuple
 
 from uwb_mitigation.types.stamps import NS_PER_S
@@ -142,7 +140,7 @@ class DeadReckoning:
             vx, vy, yaw_rate = _twist_of_poses(last.pose, pose, dt, twist)
             speed = math.hypot(vx, vy)
         of_x, of_y, of_yaw_rate = twist_variance
-        of_speed = _known_variance(max(of_x, of_y), SPEED_SD)
+        of_speed = _known_variance(of_x if of_x > of_y else of_y, SPEED_SD)
         of_yaw_rate = _known_variance(of_yaw_rate, YAW_RATE_SD)
         drift, turn_sd = WHEEL_DRIFT * speed, WHEEL_TURN
         yaw_density = of_yaw_rate * dt + _TURN_NOISE * yaw_rate * yaw_rate
@@ -248,5 +246,18 @@ def _twist_of_poses(
 
 def _moved(point: PathPoint, rates: tuple[float, ...], dt: float, source: int) -> PathPoint:
     """Return the point after a time with constant rates of its values."""
-    changes = map(mul, rates, repeat(dt))
-    return PathPoint._make((point.segment, *map(add, point[1:9], changes), source))
+    # Names instead of loops: this runs for each message and each range.
+    segment, x, y, yaw, distance_m, drift, turn, position_variance, yaw_variance, _ = point
+    vx, vy, yaw_rate, speed, drift_rate, turn_rate, position_density, yaw_density = rates
+    return PathPoint(
+        segment,
+        x + dt * vx,
+        y + dt * vy,
+        yaw + dt * yaw_rate,
+        distance_m + dt * speed,
+        drift + dt * drift_rate,
+        turn + dt * turn_rate,
+        position_variance + dt * position_density,
+        yaw_variance + dt * yaw_density,
+        source,
+    )

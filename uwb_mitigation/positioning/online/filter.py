@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.blas import dscal
 
 from uwb_mitigation.positioning.geometry import Symmetry
 from uwb_mitigation.positioning.noise_model import NoiseModel
@@ -18,10 +19,11 @@ from uwb_mitigation.positioning.online.robust_update import SHORTEST_M, RobustUp
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.tracks import Estimate
 
+KinematicState = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+"""Position, velocity and covariance of both, float64 (3,), (3,) and (6, 6)."""
+
 OFFSET = 6
 FIRST_ERROR = 7
-
-_IDENTITY = np.eye(3, 6)
 
 
 class RangeFilter:
@@ -39,7 +41,7 @@ class RangeFilter:
         is_level: as given.
         time_s: of the state, s.
         state: mean, covariance and updates.
-        unseen: float64 (3, 3), m^2, covariance of the position for what the state does not contain: constant errors, other solutions.
+        unseen: float64 (6, 6), covariance of the position (m^2; 0 for the velocity) for what the state does not contain: constant errors, other solutions.
     """
 
     __slots__ = ("_anchors", "_model", "is_level", "state", "time_s", "unseen")
@@ -58,7 +60,7 @@ class RangeFilter:
         self._anchors: list[list[float]] = anchors.position.tolist()
         self._model, self.is_level, self.time_s = model, level, time_s
         self.state = RobustUpdate(anchors, model, np.concatenate([position, np.zeros(3)]))
-        self.state.P[:3, :3], self.unseen = covariance, np.zeros((3, 3))
+        self.state.P[:3, :3], self.unseen = covariance, np.zeros((6, 6))
         for axis in range(2 if level else 3):
             self.state.P[3 + axis, 3 + axis] = model.speed**2
 
@@ -86,18 +88,13 @@ class RangeFilter:
         if dt <= 0.0:
             return
         self.time_s = time_s
-        moments, F = self.state.moments, _IDENTITY.copy()
-        F[0, 3] = F[1, 4] = F[2, 5] = dt
-        moments[:3] = F.dot(moments[:6])
-        moments[:, :3] = moments[:, :6].dot(F.T)
-        q = self._model.acceleration**2 * dt
-        cross, of_position = q * dt / 2.0, q * dt * dt / 3.0
-        for axis in range(2 if self.is_level else 3):
-            moments[axis, axis] += of_position
-            moments[axis, axis + 3] += cross
-            moments[axis + 3, axis] += cross
-            moments[axis + 3, axis + 3] += q
-        self.state.predict_errors(dt / self._model.persistence_s)
+        axes, state, q = 2 if self.is_level else 3, self.state, self._model.acceleration**2 * dt
+        state.add_states([(axis, dt, axis + 3) for axis in range(axes)])
+        state.add_noise(0, 0, axes, q * dt * dt / 3.0)
+        state.add_noise(0, 3, axes, q * dt / 2.0)
+        state.add_noise(3, 0, axes, q * dt / 2.0)
+        state.add_noise(3, 3, axes, q)
+        state.predict_errors(dt / self._model.persistence_s)
 
     def update(
         self, anchor: int, range_m: float, variance_m2: float, is_corrected: bool
@@ -143,10 +140,16 @@ class RangeFilter:
 
     def estimate(self, stamp_ns: int) -> Estimate:
         """Return position and velocity, at the stamp that the state is for."""
+        return Estimate(stamp_ns, *self.solution())
+
+    def solution(self) -> KinematicState:
+        """Return position, velocity and covariance of an estimate."""
         state = self.state
-        x, covariance = state.x, state.P[:6, :6] * state.covariance_scale()
-        covariance[:3, :3] += self.unseen
-        return Estimate(stamp_ns, x[:3].copy(), x[3:6].copy(), covariance)
+        # In place and contiguous, which takes a third of the time.
+        x, covariance = state.x, state.P[:6, :6].copy()
+        dscal(state.covariance_scale(), covariance.reshape(-1))
+        covariance += self.unseen
+        return x[:3].copy(), x[3:6].copy(), covariance
 
     @property
     def position(self) -> NDArray[np.float64]:

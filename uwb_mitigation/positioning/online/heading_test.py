@@ -94,6 +94,7 @@ class HeadingTest:
         self._path = [0j] * len(_FAULTS)
         self._fitted_m, self._variance, self._drift = 0.0, math.inf, 0.0
         self._rotation: float | None = None
+        self._judge()
 
     def forget_positions(self) -> None:
         """Start again with other positions, but keep the evidence and the latest fit: faults of odometry stay."""
@@ -157,15 +158,19 @@ class HeadingTest:
             return math.inf
         difference = math.remainder(self._rotation + point.yaw - yaw, math.tau)
         limit = CONTRADICTION**2 * (variance + self._variance + self._drift)
-        *others, late = self._evidence
-        least = min(others)
-        self.contradicts = min(least, late) < IDENTIFIED or difference**2 > limit
-        if self.contradicts or least < EXCLUDED or self._variance > MAX_FIT_SD**2:
+        self.contradicts = self._is_faulty or difference * difference > limit
+        if self.contradicts or not self._is_confirmed:
             return math.inf
         change = 0.0
-        if late < EXCLUDED:
+        if self._may_be_late:
             change = max(CHANGES * (self._fastest - self._slowest) * _MAX_DELAY_S, MIN_CHANGE)
         return max(variance, self._variance, (difference / FIT_SD) ** 2, (change / LATE_SD) ** 2)
+
+    def _judge(self) -> None:
+        """Update what follows from evidence and fit: `variance` runs after each range."""
+        *others, late = self._evidence
+        self._is_faulty, self._may_be_late = min(*others, late) < IDENTIFIED, late < EXCLUDED
+        self._is_confirmed = min(others) >= EXCLUDED and self._variance <= MAX_FIT_SD**2
 
     def _fit(self) -> None:
         """Fit the latest path for each fault, and add the log likelihood ratios."""
@@ -209,3 +214,4 @@ class HeadingTest:
         self._variance = float(square[0] + UNSEEN_M**2) / (2.0 * float(np.mean(np.abs(position) ** 2)))
         # From the beginning of the fitted path until now.
         self._drift = sum(float(drift[-1] - drift[fitted.start]) ** 2 for drift in drifts)
+        self._judge()

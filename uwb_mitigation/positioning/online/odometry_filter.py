@@ -23,8 +23,6 @@ from uwb_mitigation.types.anchors import AnchorMap
 
 YAW, SCALE, DRIFT, TURN, MOTION = 3, 4, 5, 6, 7
 
-_IDENTITY = np.eye(SCALE, MOTION)
-
 SCALE_SD = 0.05
 """Standard deviation of the constant relative error of distances: wheel diameters."""
 
@@ -51,7 +49,7 @@ class OdometryFilter:
         state: mean, covariance and updates.
     """
 
-    __slots__ = ("_anchors", "_level", "_lever_arm", "_model", "point", "state", "time_s")
+    __slots__ = ("_anchors", "_lever_arm", "_model", "point", "state", "time_s")
 
     def __init__(
         self,
@@ -63,7 +61,7 @@ class OdometryFilter:
         yaw: tuple[float, float],
     ) -> None:
         self._anchors: list[list[float]] = anchors.position.tolist()
-        self._model, self._level = model, start.is_level
+        self._model = model
         self.time_s, self.point, self._lever_arm = start.time_s, point, lever_arm
         motion = np.zeros(MOTION)
         motion[:3], motion[YAW] = start.position, yaw[0]
@@ -97,24 +95,23 @@ class OdometryFilter:
                 x[index] = P[index] = P[:, index] = 0.0
                 P[index, index] = 1.0
         east, north, _, yaw, scale, yaw_drift, yaw_turn = x[:MOTION].tolist()
-        cosine, sine = math.cos(yaw - before.yaw), math.sin(yaw - before.yaw)
-        dx, dy = cosine * dx - sine * dy, sine * dx + cosine * dy
+        dx, dy = _rotated(dx, dy, yaw - before.yaw)
         scale += 1.0
         if distance or drift or turn:
-            F = _IDENTITY.copy()
-            F[0, YAW], F[0, SCALE], F[1, YAW], F[1, SCALE] = -scale * dy, dx, scale * dx, dy
-            F[YAW, DRIFT], F[YAW, TURN] = drift, turn
-            P[:SCALE] = F.dot(P[:MOTION])
-            P[:, :SCALE] = P[:, :MOTION].dot(F.T)
+            # The position depends on the yaw before.
+            of_base = (0, -scale * dy, YAW), (0, dx, SCALE), (1, scale * dx, YAW), (1, dy, SCALE)
+            self.state.add_states((*of_base, (YAW, drift, DRIFT), (YAW, turn, TURN)))
         x[0], x[1] = east + scale * dx, north + scale * dy
         x[YAW] = yaw + turned + drift * yaw_drift + turn * yaw_turn
         # Sums are smaller than before if they were extrapolated.
-        q = max(of_position, 0.0)
-        P[0, 0] += q
-        P[1, 1] += q
-        P[YAW, YAW] += max(of_yaw, 0.0)
-        driven = max(distance, 0.0) / (self._model.persistence_s * WALKING_SPEED)
-        self.state.predict_errors(driven + dt / STATIONARY_S)
+        if of_position > 0.0:
+            self.state.add_noise(0, 0, 2, of_position)
+        if of_yaw > 0.0:
+            P[YAW, YAW] += of_yaw
+        elapsed = dt / STATIONARY_S
+        if distance > 0.0:
+            elapsed += distance / (self._model.persistence_s * WALKING_SPEED)
+        self.state.predict_errors(elapsed)
 
     def update(
         self, anchor: int, range_m: float, variance_m2: float, is_corrected: bool
@@ -132,11 +129,10 @@ class OdometryFilter:
         return state.update_range(anchor, range_m, distance, variance_m2, is_corrected)
 
     def set_height(self, height_m: float, variance_m2: float) -> None:
-        """Set the height of the antenna: the odometry is horizontal, so that ranges only determine it, unless it is constant."""
-        if not self._level:
-            P = self.state.P
-            P[2] = P[:, 2] = 0.0
-            self.state.x[2], P[2, 2] = height_m - self._lever_arm[2], variance_m2
+        """Set the height of the antenna: the odometry is horizontal, so that ranges only determine it."""
+        P = self.state.P
+        P[2] = P[:, 2] = 0.0
+        self.state.x[2], P[2, 2] = height_m - self._lever_arm[2], variance_m2
 
     def confine(self, area: Area) -> None:
         """Move the antenna into a box."""
@@ -151,16 +147,10 @@ class OdometryFilter:
 
     def velocity(self, odometry: DeadReckoning) -> tuple[float, float, float]:
         """Return the velocity of the antenna (m/s) and its variance in each axis (m^2/s^2), with the latest twist of the odometry."""
-        vx, vy, yaw_rate = odometry.twist or (0.0, 0.0, 0.0)
-        yaw = self.yaw
-        arm_x, arm_y = self._arm(yaw)
-        cosine, sine = math.cos(yaw), math.sin(yaw)
-        variance = odometry.twist_variance[0] + self.yaw_variance * (vx * vx + vy * vy)
-        return (
-            cosine * vx - sine * vy - yaw_rate * arm_y,
-            sine * vx + cosine * vy + yaw_rate * arm_x,
-            variance,
-        )
+        (x, y, yaw_rate), yaw = odometry.twist or (0.0, 0.0, 0.0), self.state.x.item(YAW)
+        (vx, vy), (arm_x, arm_y) = _rotated(x, y, yaw), self._arm(yaw)
+        variance = odometry.twist_variance[0] + self.yaw_variance * (x * x + y * y)
+        return vx - yaw_rate * arm_y, vy + yaw_rate * arm_x, variance
 
     def published_covariance(self) -> tuple[float, ...]:
         """Return the covariance of x and y of the antenna and of the yaw: xx, xy, yy, x yaw, y yaw, yaw yaw (m^2, m rad, rad^2)."""
@@ -198,7 +188,9 @@ class OdometryFilter:
     def _arm(self, yaw: float) -> tuple[float, float]:
         """Return the horizontal lever arm in the axes of the map."""
         x, y, _ = self._lever_arm
-        if x == y == 0.0:
-            return 0.0, 0.0
-        cosine, sine = math.cos(yaw), math.sin(yaw)
-        return cosine * x - sine * y, sine * x + cosine * y
+        return (0.0, 0.0) if x == y == 0.0 else _rotated(x, y, yaw)
+
+
+def _rotated(x: float, y: float, angle: float) -> tuple[float, float]:
+    cosine, sine = math.cos(angle), math.sin(angle)
+    return cosine * x - sine * y, sine * x + cosine * y

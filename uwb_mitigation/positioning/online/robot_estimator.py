@@ -18,6 +18,7 @@ import numpy as np
 
 from uwb_mitigation.positioning.config import EstimatorConfig, RobotData
 from uwb_mitigation.positioning.online.dead_reckoning import DeadReckoning, PathPoint
+from uwb_mitigation.positioning.online.filter import RangeFilter
 from uwb_mitigation.positioning.online.heading_test import HeadingTest
 from uwb_mitigation.positioning.online.initialization import IMPLAUSIBLE
 from uwb_mitigation.positioning.online.measurements import TagHeight, TagRange
@@ -52,6 +53,10 @@ VERIFIED_SEPARATION = 1.0
 
 FORGIVEN_S = 60.0
 """Time constant of the number of rejections, which reduces the weight of the odometry."""
+
+
+_SEPARATE = np.kron(np.eye(2), np.ones((3, 3)))
+"""Covariances of position and velocity that are not 0 in a mixture."""
 
 
 def make_estimator(config: EstimatorConfig) -> TagEstimator | RobotEstimator:
@@ -127,11 +132,9 @@ class RobotEstimator:
         while self._recorded and self._recorded[0][0] <= measurement.stamp_ns:
             recorded_ns, add, values = self._recorded.popleft()
             add(recorded_ns, *values)
-        estimate = self.tag.add_range(measurement)
+        published = self.tag.update(measurement)
         self._update_headings(measurement)
-        if estimate is None or self._heading_filter is None:
-            return estimate
-        return self._mixture(estimate, self._heading_filter)
+        return self._estimate(published, self._heading_filter, measurement.stamp_ns)
 
     def run(self, ranges: Ranges) -> Track:
         """Process recorded ranges, and heights and motion of the config; return an estimate for each range with one."""
@@ -139,19 +142,15 @@ class RobotEstimator:
 
     def predict_at(self, stamp_ns: int) -> Estimate | None:
         """Predict position and heading at a time after the latest range; None: not known."""
-        estimate, point = self.tag.predict_at(stamp_ns), self.odometry.point_at(stamp_ns)
-        if (
-            estimate is None
-            or self._heading_filter is None
-            or point is None
-            or point.segment != self._heading_filter.point.segment
-        ):
-            return estimate
-        predicted = self._heading_filter.copy()
-        predicted.advance(self.tag.seconds(stamp_ns), point)
-        if self._area is not None:
-            predicted.confine(self._area)
-        return self._mixture(estimate, predicted)
+        point, predicted = self.odometry.point_at(stamp_ns), self._heading_filter
+        if predicted is not None and point is not None and point.segment == predicted.point.segment:
+            predicted = predicted.copy()
+            predicted.advance(self.tag.seconds(stamp_ns), point)
+            if self._area is not None:
+                predicted.confine(self._area)
+        else:
+            predicted = None
+        return self._estimate(self.tag.predicted(stamp_ns), predicted, stamp_ns)
 
     def restart(self, stamp_ns: int | None = None) -> None:
         """Reset position and heading, but not the statistics."""
@@ -163,22 +162,28 @@ class RobotEstimator:
         recorded: list[tuple[int, Callable[..., None], Any]] = []
         if (imu := self._robot.imu) is not None:
             rows = rows_of(imu.stamp_ns, imu.yaw_rate, imu.yaw_rate_variance)
-            recorded += [(stamp_ns, self.odometry.add_imu, values) for stamp_ns, *values in rows]
+            add_imu = self.odometry.add_imu
+            recorded += [(stamp_ns, add_imu, values) for stamp_ns, *values in rows]
         if (motion := self._robot.odometry) is not None:
             variance = np.diagonal(motion.twist_covariance, axis1=1, axis2=2)
             rows = rows_of(motion.stamp_ns, motion.pose, motion.twist, variance)
-            recorded += [(stamp_ns, self.odometry.add, values) for stamp_ns, *values in rows]
+            add = self.odometry.add
+            recorded += [(stamp_ns, add, values) for stamp_ns, *values in rows]
         return recorded
 
-    def _mixture(self, ranges_only: Estimate, heading_filter: OdometryFilter) -> Estimate:
-        """Return the mean of both solutions; its covariance includes their difference."""
-        # The height and its velocity are those of the ranges-only estimate, which is new: it can be changed in place.
-        assert self.tag.filter is not None
+    def _estimate(
+        self, ranges_only: RangeFilter | None, heading_filter: OdometryFilter | None, stamp_ns: int
+    ) -> Estimate | None:
+        """Return the mean of both solutions; its covariance includes their difference. Without a heading, it is that of ranges only."""
+        if ranges_only is None:
+            return None
+        position, velocity, covariance = self.tag.solution(ranges_only)
+        if heading_filter is None:
+            return Estimate(stamp_ns, position, velocity, covariance)
         excess = 2.0 * (self._separation - EQUAL_SEPARATION)
         weight = math.exp(-self._rejections) / (1.0 + math.exp(min(excess, 50.0)))
-        position, covariance = ranges_only.position, ranges_only.covariance
         # Python numbers are faster here than NumPy.
-        covariance_at, unseen_at = covariance.item, self.tag.filter.unseen.item
+        covariance_at, unseen_at = covariance.item, ranges_only.unseen.item
         x, y, _ = heading_filter.antenna
         x0, y0 = position.item(0), position.item(1)
         dx, dy = x0 - x, y0 - y
@@ -192,21 +197,20 @@ class RobotEstimator:
         covariance[1, 1] = rest * covariance_at(1, 1) + of_mean * (yy + unseen_at(1, 1)) + apart * dy * dy
         covariance[0, 2] = covariance[2, 0] = (1.0 - weight) * covariance_at(0, 2)
         covariance[1, 2] = covariance[2, 1] = (1.0 - weight) * covariance_at(1, 2)
-        covariance[:3, 3:] = covariance[3:, :3] = 0.0
+        covariance *= _SEPARATE
         position[0], position[1] = x0 - weight * dx, y0 - weight * dy
         if self._area is not None:
             position = self._area.clip(position)
         yaw = math.remainder(heading_filter.yaw, math.tau)
         variance = self._test.variance(yaw, yaw_variance, heading_filter.point)
         self._is_confirmed = variance < KNOWN_YAW_SD**2
-        velocity = ranges_only.velocity
         heading: Heading | None = None
         if self._is_confirmed:
             velocity[0], velocity[1], speed_variance = heading_filter.velocity(self.odometry)
             covariance[3, 4] = covariance[4, 3] = 0.0
             covariance[3, 3] = covariance[4, 4] = speed_variance
             heading = Heading(yaw, np.array([weight * x_yaw, weight * y_yaw, 0.0, variance]))
-        return Estimate(ranges_only.stamp_ns, position, velocity, covariance, heading)
+        return Estimate(stamp_ns, position, velocity, covariance, heading)
 
     def _update_headings(self, measurement: TagRange) -> None:
         tag = self.tag
@@ -219,7 +223,9 @@ class RobotEstimator:
             self._start_yaws(point)
             return
         dt = time_s - self._yaws[0].filter.time_s
-        height = None if tag.filter is None else (tag.filter.state.x.item(2), tag.filter.state.P.item(2, 2))
+        height = None
+        if tag.filter is not None and not tag.filter.is_level:
+            height = tag.filter.state.x.item(2), tag.filter.state.P.item(2, 2)
         for hypothesis in self._yaws:
             filter_ = hypothesis.filter
             filter_.advance(time_s, point)
@@ -248,13 +254,14 @@ class RobotEstimator:
         dx, dy = x - state.x.item(0), y - state.x.item(1)
         a, b, c = state.P.item(0, 0), state.P.item(0, 1), state.P.item(1, 1)
         separation = (c * dx * dx - 2.0 * b * dx * dy + a * dy * dy) / max(a * c - b * b, 1e-12)
-        self._separation += min(max(dt, 0.0) / SEPARATION_S, 1.0) * (separation - self._separation)
-        self._rejections *= math.exp(-max(dt, 0.0) / FORGIVEN_S)
+        if dt > 0.0:
+            self._separation += min(dt / SEPARATION_S, 1.0) * (separation - self._separation)
+            self._rejections *= math.exp(-dt / FORGIVEN_S)
         # Large range errors move the ranges-only solution away from correct odometry, too.
         scale = max(state.covariance_scale(), 1.0)
         if self._separation < VERIFIED_SEPARATION * scale:
             self._is_rejected = False
-        if self._separation > REJECTED_SEPARATION * scale:
+        elif self._separation > REJECTED_SEPARATION * scale:
             self._reset_heading("odometry wrong")
             self._rejections += 1.0
             self._is_rejected = True

@@ -12,11 +12,11 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.blas import dger
+from scipy.linalg.blas import daxpy, ddot, dger
 
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.types.anchors import AnchorMap
@@ -71,6 +71,8 @@ RESIDUAL_RATE = 0.001
 MIN_UNIT, MAX_ELAPSED = 1e-3, 100.0
 """Limits of `RobustUpdate.error_unit`, and of the time constants of one prediction."""
 
+_ONES = np.ones(3)
+
 PRIOR_SHARE = 0.05
 """Weight of the modelled variance of persisting errors among these: that of ranges of which this share is redundant."""
 
@@ -116,11 +118,14 @@ class RobustUpdate:
         self.P[errors, errors] = self._error_variance
 
     def _set_moments(self, moments: NDArray[np.float64]) -> None:
-        self.moments = moments
+        self.moments = moments = np.ascontiguousarray(moments)
+        self._flat, self._size = moments.reshape(-1), moments.shape[1]
         self.P: NDArray[np.float64] = moments[:-1]
         self.x: NDArray[np.float64] = moments[-1]
         self.H = np.zeros(len(self.x))
         self.H[self._offset] = 1.0
+        # States of errors whose derivatives are not 0.
+        self._used: tuple[int, ...] = ()
 
     def copy(self) -> RobustUpdate:
         """Return an independent copy."""
@@ -164,9 +169,21 @@ class RobustUpdate:
 
     def predict_errors(self, elapsed: float) -> None:
         """Predict the persisting errors after `elapsed` time constants."""
-        self.error_unit *= math.exp(-min(elapsed, MAX_ELAPSED))
+        self.error_unit *= math.exp(-elapsed if elapsed < MAX_ELAPSED else -MAX_ELAPSED)
         if self.error_unit < MIN_UNIT:
             self.normalise()
+
+    def add_states(self, terms: Iterable[tuple[int, float, int]]) -> None:
+        """Add to a state another one multiplied by a factor, in the covariance, too: (added to, factor, added) in this order."""
+        flat, n = self._flat, self._size
+        for target, factor, source in terms:
+            # Row and column: products of small matrices take several times as long.
+            daxpy(flat, flat, n, factor, source * n, 1, target * n, 1)
+            daxpy(flat, flat, n + 1, factor, source, n, target, n)
+
+    def add_noise(self, row: int, column: int, count: int, variance: float) -> None:
+        """Add to that number of elements of the covariance, from a row and a column on along the diagonal."""
+        daxpy(_ONES, self._flat, count, variance, 0, 1, row * self._size + column, self._size + 1)
 
     def normalise(self) -> None:
         """Convert the persisting errors in `x` and `P` to metres, with their noise."""
@@ -199,8 +216,10 @@ class RobustUpdate:
         constant = self._constant_row(anchor) if is_corrected else 0
         self._is_raw[anchor] = not is_corrected
         model, x, H, P, k = self._model, self.x, self.H, self.P, self._offset
-        row = k + 1 + anchor
-        factor = 1.0 if is_corrected else min(max(self.raw_ratio / LARGE_RATIO, 1.0), MAX_RATIO)
+        row, factor = k + 1 + anchor, 1.0
+        # A condition is faster here than `max`.
+        if self.raw_ratio > LARGE_RATIO and not is_corrected:
+            factor = min(self.raw_ratio / LARGE_RATIO, MAX_RATIO)
         variance, error_variance = factor * model.variance(variance_m2), self._error_variance[anchor]
         unit = self.error_unit
         noise_until = 1.0 / (unit * unit)
@@ -212,7 +231,9 @@ class RobustUpdate:
         self._error_variance[anchor] = error_variance + 0.1 * (
             (1.0 - white_share) * variance - error_variance
         )
-        H[k + 1 :] = 0.0
+        for used in self._used:
+            H[used] = 0.0
+        self._used = (row, constant) if is_corrected else (row,)
         H[row] = unit
         residual = range_m - distance_m - x.item(k)
         if is_corrected and variance > UNCERTAIN_SD**2:
@@ -232,7 +253,10 @@ class RobustUpdate:
             curvature = (P.item(0, 0) + P.item(1, 1)) / max(distance_m, SHORTEST_M)
             white += 0.5 * curvature * curvature
         z, sd = self.update(H, innovation, white)
-        residual /= math.sqrt(model.inflation(z))
+        limit = model.long if z > 0.0 else -model.short
+        if z / limit > 1.0:
+            # The square root of the factor of the variance.
+            residual *= limit / z
         # White noise does not contribute to the mean of this product.
         square = residual * self._last_residual[anchor]
         self._last_residual[anchor] = residual
@@ -250,11 +274,12 @@ class RobustUpdate:
         # The method `dot` and BLAS are faster here than operators.
         product = self.moments.dot(H)
         PH = product[:-1]
-        S = float(H.dot(PH)) + max(R, MIN_VARIANCE_M2)
+        S = ddot(H, PH) + max(R, MIN_VARIANCE_M2)
         sd = math.sqrt(S)
         z, product[-1] = innovation / sd, -innovation
-        gain = PH.copy()
+        gain = PH
         if not self.estimates_errors:
+            gain = PH.copy()
             gain[self._offset :] = 0.0
         # This is Joseph's form for these gains: moments -= product gain.T / S, in place.
         factor = -1.0 / (S * self._model.inflation(z) if robust else S)
@@ -298,7 +323,8 @@ class RobustUpdate:
         The filter sees only a part of the persisting errors, so that their true variance differs from the model by more than
         `consistency`. The power and the limits were chosen on simulated drives, the Hanyang runs and the labyrinth.
         """
-        return min(max(SCALE * math.pow(self.consistency, POWER), MIN_SCALE), MAX_SCALE)
+        scale = SCALE * math.pow(self.consistency, POWER)
+        return scale if MIN_SCALE < scale < MAX_SCALE else min(max(scale, MIN_SCALE), MAX_SCALE)
 
     def hidden_offset_covariance(self) -> NDArray[np.float64]:
         """Return what a position's published covariance (3, 3) lacks of the common offset, m^2.

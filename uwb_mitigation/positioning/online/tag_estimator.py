@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.geometry import Dop, Height, dop
 from uwb_mitigation.positioning.online.ambiguity import SAME_M, AmbiguityCheck
-from uwb_mitigation.positioning.online.filter import RangeFilter
+from uwb_mitigation.positioning.online.filter import KinematicState, RangeFilter
 from uwb_mitigation.positioning.online.initialization import (
     IMPLAUSIBLE,
     CandidatePosition,
@@ -56,6 +56,8 @@ MAX_AMBIGUOUS_S = 2.0
 
 _UNDETERMINED_M = 5.0
 """A position with a larger horizontal standard deviation is not determined by the ranges."""
+
+_WITHOUT_HEIGHT = np.outer([1, 1, 0, 1, 1, 1], [1.0, 1, 0, 1, 1, 1])
 
 _RETAINED_RANGES = 400
 _MAX_CANDIDATES = 12
@@ -155,6 +157,11 @@ class TagEstimator:
 
     def add_range(self, measurement: TagRange) -> Estimate | None:
         """Update with a valid range; see `add`."""
+        published = self.update(measurement)
+        return None if published is None else Estimate(measurement.stamp_ns, *self.solution(published))
+
+    def update(self, measurement: TagRange) -> RangeFilter | None:
+        """Update with a valid range; return the filter whose `solution` can be published."""
         stamp_ns, anchor, range_m, variance_m2, _ = measurement
         time_s = self.seconds(stamp_ns)
         if time_s < self._time_s:
@@ -179,9 +186,7 @@ class TagEstimator:
             self._search(measurement)
         else:
             self._follow(self.filter, measurement)
-        if self.filter is None or self.images.is_ambiguous:
-            return None
-        return self._estimate(self.filter, stamp_ns)
+        return None if self.images.is_ambiguous else self.filter
 
     def run(self, ranges: Ranges) -> Track:
         """Process recorded ranges, and the measured heights of the config; return an estimate for each range with one."""
@@ -189,12 +194,17 @@ class TagEstimator:
 
     def predict_at(self, stamp_ns: int) -> Estimate | None:
         """Predict the position at a time after the latest range; None: not known."""
+        predicted = self.predicted(stamp_ns)
+        return None if predicted is None else Estimate(stamp_ns, *self.solution(predicted))
+
+    def predicted(self, stamp_ns: int) -> RangeFilter | None:
+        """Return the filter at a time after the latest range, see `update`."""
         if self.filter is None or self.is_ambiguous:
             return None
         predicted = self.filter.copy()
         predicted.predict(self.seconds(stamp_ns))
         self._confine(predicted)
-        return self._estimate(predicted, stamp_ns)
+        return predicted
 
     def restart(self, stamp_ns: int | None = None) -> None:
         """Reset the position, but not the statistics."""
@@ -255,13 +265,14 @@ class TagEstimator:
             self._next_check_s = -math.inf
         z, _ = filter_.update(*measurement[1:])
         self._confine(filter_)
-        limited = max(-10.0, min(10.0, z))
+        limited = z if -10.0 < z < 10.0 else math.copysign(10.0, z)
         self.innovation_mean += 0.01 * (limited - self.innovation_mean)
         self.innovation_square += 0.01 * (limited * limited - self.innovation_square)
         state = self._states[measurement.anchor]
         state.outliers += 0.1 * ((abs(z) > OUTLIER) - state.outliers)
         state.short += 0.1 * ((z < -OUTLIER) - state.short)
-        state.mean_z += 0.02 * (max(-5.0, min(5.0, z)) - state.mean_z)
+        limited = z if -5.0 < z < 5.0 else math.copysign(5.0, z)
+        state.mean_z += 0.02 * (limited - state.mean_z)
         if self._time_s >= self._next_check_s:
             self._next_check_s = self._time_s + _RETRY_S
             received, was_ambiguous = self.received_anchors(), self.is_ambiguous
@@ -289,18 +300,17 @@ class TagEstimator:
         is_short = any(2.0 * state.short > state.outliers for state in contradicting)
         return is_most or is_short or self._time_s > self._blocked_since_s + OBSTACLE_S
 
-    def _estimate(self, filter_: RangeFilter, stamp_ns: int) -> Estimate:
-        """Return the estimate of a filter for publication, with the known height and a covariance that contains images."""
-        estimate = filter_.estimate(stamp_ns)
-        covariance, position = estimate.covariance, estimate.position
+    def solution(self, filter_: RangeFilter) -> KinematicState:
+        """Return position, velocity and covariance of an estimate, with the known height and a covariance that contains images."""
+        position, velocity, covariance = filter_.solution()
         if self.images.mirror is not None:
             position += self.images.shift
         if self._height is not None:
             # Constant errors of ranges would move it in the filter.
             position[2] = self._height.value
-            covariance[2] = covariance[:, 2] = 0.0
+            covariance *= _WITHOUT_HEIGHT
             covariance[2, 2] = self._height.sd**2
-        return estimate
+        return position, velocity, covariance
 
     def _confine(self, filter_: RangeFilter) -> None:
         """Keep a filter inside the area."""
