@@ -48,25 +48,24 @@ class PositionMonitor:
         self._residuals = defaultdict[Anchor, deque[_Residual]](lambda: deque(maxlen=MAX_RANGES))
 
     @property
-    def silent_s(self) -> float:
-        """Time since the last range, s; 0 while ranges arrive: what is known of the tag is current."""
-        age_s = self._now_s() - self._received_s
-        return age_s if age_s > NO_DATA_S else 0.0
+    def age_s(self) -> float:
+        """Time since the last range, s."""
+        return self._now_s() - self._received_s
 
     def add(self, anchor: Anchor, corrected: CorrectedRange, estimate: Estimate | None) -> None:
         """Add a range, and the estimate of the antenna after it."""
         self._received_s, self._estimate = self._now_s(), estimate
         residual_m = math.nan
         if estimate is not None:
-            residual_m = corrected.range_m - math.dist(estimate.position, anchor.position)
+            residual_m = corrected.range_m - math.dist(estimate.position.tolist(), anchor.position)
         # The power gap of the CIR, with which the viewer recognises NLOS, is not in corrected ranges.
         is_uncertain = corrected.status.is_corrected and corrected.variance_m2 > LONG_M**2
         self._residuals[anchor].append(_Residual(self._received_s, residual_m, is_uncertain))
 
     def verdict(self) -> Verdict:
         """Return the verdict on the latest position."""
-        if self.silent_s:
-            reason = f"no ranges of {self.name} for {self.silent_s:.0f} s"
+        if self.age_s > NO_DATA_S:
+            reason = f"no ranges of {self.name} for {self.age_s:.0f} s"
             return Verdict(health.LOST, reason, "Check power of the tag, and the driver.")
         current, estimate = current_determination(self._tag.estimator), self._estimate
         statement, _, remedy = str(current).partition(". Remedy: ")
