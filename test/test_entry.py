@@ -45,6 +45,15 @@ def test_help_lists_every_parameter_without_ros(node: str, tables: list[str], tm
     assert all(f"\n  {row.name}:=" in output for table in tables for row in TABLES[table])
 
 
+@pytest.mark.parametrize("node", ["monitor", "mitigator"])
+def test_arguments_that_ros_cannot_parse_are_an_error_without_a_traceback(node: str):
+    pytest.importorskip("rclpy")
+    process = run(node, "--ros-args", "-r", "uwb/range_raw:=/a//b")
+    output, _ = process.communicate(timeout=240)
+    assert (process.returncode, "Traceback" in output) == (1, False), output
+    assert "check what follows --ros-args, and the environment" in output
+
+
 @pytest.mark.parametrize(("words", "code"), [([], 1), (["--help"], 0)])
 def test_module_without_a_node_names_the_nodes_in_one_line(words: list[str], code: int):
     command = [sys.executable, "-m", "uwb_mitigation.commands.entry", *words]

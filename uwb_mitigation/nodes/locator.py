@@ -74,6 +74,9 @@ PREDICT_AFTER_S, PREDICT_UNTIL_S = 0.3, 30.0
 """A tag without ranges is predicted between these ages of its last range; later the covariance exceeds most halls."""
 
 
+STALE_S = 10.0
+"""After this time without ranges of a tag, the diagnostics contain only its verdict: until then, it may return."""
+
 _REPEAT_AFTER_NS = 300_000_000
 """After this time without estimates, map to odom is repeated."""
 
@@ -197,7 +200,9 @@ class Locator(ManagedNode):
         monitors = [outputs.monitor for outputs in self._outputs.values()]
         sentences = {monitor.name: monitor.sentence() for monitor in monitors}
         # The estimators know nothing of the time after the last range of a tag.
-        stale = tuple(f"{monitor.name}{end}" for monitor in monitors if monitor.silent_s for end in ": ")
+        stale = tuple(
+            f"{monitor.name}{end}" for monitor in monitors if monitor.age_s > STALE_S for end in ": "
+        )
         values = {key: value for key, value in estimator.diagnostics().items() if not key.startswith(stale)}
         warnings = [text for is_good, text in sentences.values() if not is_good]
         # The sentences contain the statements on ambiguous positions.

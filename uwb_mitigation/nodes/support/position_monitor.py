@@ -6,7 +6,6 @@ import math
 import time
 from collections import defaultdict, deque
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
@@ -24,14 +23,6 @@ MAX_RANGES = 50
 """Number of latest ranges of an anchor whose mean residual is compared with the limits."""
 
 
-class _Residual(NamedTuple):
-    """Reception of a range, s; range minus distance to the estimate, m, NaN without one; whether its correction is uncertain."""
-
-    received_s: float
-    residual_m: float
-    is_uncertain: bool
-
-
 class PositionMonitor:
     """Receives the ranges and estimates of one tag.
 
@@ -45,28 +36,30 @@ class PositionMonitor:
         self._tag, self._now_s = tag, now_s
         self._received_s = now_s()
         self._estimate: Estimate | None = None
-        self._residuals = defaultdict[Anchor, deque[_Residual]](lambda: deque(maxlen=MAX_RANGES))
+        # Reception of a range, s; range minus distance to the estimate, m, NaN without one; whether its correction is uncertain.
+        self._residuals = defaultdict[Anchor, deque[tuple[float, float, bool]]](
+            lambda: deque(maxlen=MAX_RANGES)
+        )
 
     @property
-    def silent_s(self) -> float:
-        """Time since the last range, s; 0 while ranges arrive: what is known of the tag is current."""
-        age_s = self._now_s() - self._received_s
-        return age_s if age_s > NO_DATA_S else 0.0
+    def age_s(self) -> float:
+        """Time since the last range, s."""
+        return self._now_s() - self._received_s
 
     def add(self, anchor: Anchor, corrected: CorrectedRange, estimate: Estimate | None) -> None:
         """Add a range, and the estimate of the antenna after it."""
         self._received_s, self._estimate = self._now_s(), estimate
         residual_m = math.nan
         if estimate is not None:
-            residual_m = corrected.range_m - math.dist(estimate.position, anchor.position)
+            residual_m = corrected.range_m - math.dist(estimate.position.tolist(), anchor.position)
         # The power gap of the CIR, with which the viewer recognises NLOS, is not in corrected ranges.
         is_uncertain = corrected.status.is_corrected and corrected.variance_m2 > LONG_M**2
-        self._residuals[anchor].append(_Residual(self._received_s, residual_m, is_uncertain))
+        self._residuals[anchor].append((self._received_s, residual_m, is_uncertain))
 
     def verdict(self) -> Verdict:
         """Return the verdict on the latest position."""
-        if self.silent_s:
-            reason = f"no ranges of {self.name} for {self.silent_s:.0f} s"
+        if self.age_s > NO_DATA_S:
+            reason = f"no ranges of {self.name} for {self.age_s:.0f} s"
             return Verdict(health.LOST, reason, "Check power of the tag, and the driver.")
         current, estimate = current_determination(self._tag.estimator), self._estimate
         statement, _, remedy = str(current).partition(". Remedy: ")
@@ -107,13 +100,13 @@ class PositionMonitor:
         """Return the means of each anchor that was received in the last minute, as the viewer has them of its pairs."""
         result, now_s = dict[int, Means](), self._now_s()
         for anchor, rows in self._residuals.items():
-            age_s = now_s - rows[-1].received_s
-            known_m = [row.residual_m for row in rows if not math.isnan(row.residual_m)]
+            received_s, residual_m, is_uncertain = np.array(rows).T
+            age_s, known_m = now_s - float(received_s[-1]), residual_m[np.isfinite(residual_m)]
             if age_s < HISTORY_S:
                 result[anchor.id] = dict.fromkeys(("rate", "lost", "not_ok", "displaced"), 0.0) | {
-                    "residual": sum(known_m) / len(known_m) if known_m else math.nan,
+                    "residual": float(known_m.mean()) if len(known_m) else math.nan,
                     "evidence": float(len(known_m)),
-                    "nlos": 100.0 * sum(row.is_uncertain for row in rows) / len(rows),
+                    "nlos": 100.0 * float(is_uncertain.mean()),
                     "stopped": age_s if age_s > NO_DATA_S else 0.0,
                 }
         return result

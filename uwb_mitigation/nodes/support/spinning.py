@@ -63,7 +63,7 @@ def spin(nodes: Node | Sequence[Node], stop: threading.Event) -> None:
 def spinning_node(make_node: Callable[[Context], NodeT]) -> Iterator[NodeT]:
     """Yield a node in its own ROS context, spun by a thread until the block ends."""
     context = Context()
-    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+    _initialise(None, context)
     node = make_node(context)
     stop = threading.Event()
     thread = threading.Thread(target=spin, args=(node, stop), name="probe", daemon=True)
@@ -150,7 +150,11 @@ def _run(name: str) -> int:
     nodes: list[Node] = []
     code_of_errors = REFUSED
     try:
-        _initialise()
+        _initialise(words := list(sys.argv))
+        if unknown := remove_ros_args(words)[1:]:
+            raise ParameterError(
+                f"arguments {' '.join(unknown)!r}", valid="parameters follow --ros-args, as in -p name:=value"
+            )
         # Load before the handlers are installed: until then a signal terminates the process immediately.
         make_nodes = load_node(name)
         stop = stop_event()
@@ -171,22 +175,16 @@ def _run(name: str) -> int:
     return max((int(getattr(node, "exit_code", 0)) for node in nodes), default=0)
 
 
-def _initialise() -> None:
-    """Initialise ROS without its signal handlers.
+def _initialise(words: list[str] | None, context: Context | None = None) -> None:
+    """Initialise ROS without its signal handlers; `words`: None: `sys.argv`.
 
     Raises:
-        ParameterError: an argument is unknown, or ROS cannot parse it.
+        ParameterError: ROS cannot parse an argument or a variable of its environment.
     """
-    words = list(sys.argv)
     try:
-        rclpy.init(args=words, signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(args=words, context=context, signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:
         # Without positions in the source files of ROS.
         first_line = str(error).strip().splitlines()[0].split(", at /")[0]
-        raise ParameterError(
-            first_line, valid="check what follows --ros-args, and the environment: ROS_..., RMW_..."
-        ) from error
-    if unknown := remove_ros_args(words)[1:]:
-        raise ParameterError(
-            f"arguments {' '.join(unknown)!r}", valid="parameters follow --ros-args, as in -p name:=value"
-        )
+        valid = "check what follows --ros-args, and the environment: ROS_..., RMW_..."
+        raise ParameterError(first_line, valid=valid) from error
