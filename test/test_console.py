@@ -75,6 +75,25 @@ def test_help_fits_80_columns_and_needs_no_checkout(words: tuple[str, ...], tmp_
     assert wrapped_examples == []
 
 
+SIMULATED = (
+    ("--like buildings --ranges 30", "a multiple of"),
+    ("--like buildings --exchanges 0", "a multiple of"),
+    ("--channel 6", "unknown channel 6"),
+)
+EVALUATED = (
+    ("--folds 3 --scaling max", "--folds, --scaling without --cross-validate"),
+    ("--seeds 3", "--seeds without --cross-validate"),
+    ("--cross-validate configuration --offsets 0", "--offsets with --cross-validate"),
+    ("--cross-validate configuration --model x", "--model with --cross-validate"),
+)
+OFFSETS = (
+    ("--distance 5 --truth", "either --distance or --truth"),
+    ("--distance nan", "distance = nan"),
+    ("--truth -o none/o.yaml", "a file in an existing folder"),
+    ("--truth --anchor door", "anchor = 'door'"),
+)
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -83,6 +102,9 @@ def test_help_fits_80_columns_and_needs_no_checkout(words: tuple[str, ...], tmp_
         (["track", "a.mcap", "-o", "b.mcap", "--rat", "3"], "No such option: --rat"),
         (["data", "simulate", "-o", "x.mcap", "--like", "drone"], "'drone' is not one of 'drive'"),
         (["data", "simulate", "-o", "x.mcap", "--ranges", "0"], "0 ranges (1 or more"),
+        *((["data", "simulate", "-o", "x.mcap", *words.split()], message) for words, message in SIMULATED),
+        *((["evaluate", "--data", "x.mcap", *words.split()], message) for words, message in EVALUATED),
+        *((["offset", "x.mcap", *words.split()], message) for words, message in OFFSETS),
         (["data", "info", "x.mcap", "--json", "/absent/x.json"], "its folder does not exist"),
         *((["data", "info", "x.mcap", "--json", folder], "is a folder") for folder in ("/", ".")),
         *(
@@ -104,6 +126,7 @@ def test_wrong_usage_has_one_line_and_one_exit_code(words: list[str], message: s
     (line,) = done.stderr.splitlines()
     assert message in line
     assert done.stdout == ""
+    assert not list(tmp_path.iterdir())
 
 
 def test_emulated_board_runs_for_the_given_duration_if_its_recording_is_not_empty(tmp_path: Path):

@@ -87,19 +87,6 @@ def test_evaluate_writes_the_documented_keys(tmp_path, recording):
     assert "optimistic" not in result.output
 
 
-@pytest.mark.parametrize(
-    ("words", "refused"),
-    [
-        (("--folds", 3, "--scaling", "max"), "--folds, --scaling without --cross-validate"),
-        (("--seeds", 3), "--seeds without --cross-validate"),
-        (("--cross-validate", "configuration", "--offsets", 0), "--offsets with --cross-validate"),
-        (("--cross-validate", "configuration", "--model", "x"), "--model with --cross-validate"),
-    ],
-)
-def test_options_of_the_other_mode_of_evaluate_are_refused(words, refused):
-    assert refused in str(run("evaluate", "--data", "any", *words).exception)
-
-
 def test_train_quantize_evaluate_from_end_to_end(tmp_path, recording):
     pytest.importorskip("torch", reason="run `make setup-training`")
     floats, integers = tmp_path / "float.onnx", tmp_path / "int8.onnx"

@@ -157,12 +157,6 @@ def test_standard_deviation_is_larger_on_other_channels(tmp_path):
         assert passed_through.variance_m2 == 0.5
 
 
-def test_prediction_beyond_the_limits_is_out_of_distribution(tmp_path):
-    subject = Mitigation(bundle(tmp_path, SHAPE, correction_limits_m=(50.0, 60.0)))
-    result = subject.correct([measurement(3.0)])[0]
-    assert (result.status, result.range_m) == (Status.OUT_OF_DISTRIBUTION, 3.0)
-
-
 @pytest.mark.parametrize(
     ("changes", "offset_m"),
     [

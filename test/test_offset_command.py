@@ -159,21 +159,6 @@ def test_written_offsets_are_read_by_the_other_commands(direct: list[Record], tm
     assert "millimetres" in wrong.stderr
 
 
-@pytest.mark.parametrize(
-    ("options", "excerpt"),
-    [
-        (("--distance", "5", "--truth"), "either --distance or --truth"),
-        (("--distance", "nan"), "distance = nan"),
-        (("--truth", "-o", "none/o.yaml"), "a file in an existing folder"),
-        (("--truth", "--anchor", "door"), "anchor = 'door'"),
-    ],
-)
-def test_contradictory_options_are_refused_early(options: tuple[str, ...], excerpt: str, tmp_path: Path):
-    outcome = run("offset", "none.mcap", *options, folder=tmp_path)
-    assert outcome.returncode != 0
-    assert excerpt in outcome.stderr
-
-
 def test_ranges_of_another_radio_have_their_whole_error_as_offset(
     universal: Mitigation, direct: list[Record]
 ):

@@ -9,10 +9,8 @@ import os
 import signal
 import subprocess
 import sys
-from collections import Counter
 from importlib.util import find_spec
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -303,27 +301,6 @@ def test_ranges_are_sent_as_ekf2_accepts_them(ros: Ros, px4_msgs: None, tmp_path
         ros.spin_for(0.1)
     assert len(received()) == before
     assert node.signal(signal.SIGINT) == 0, node.output
-
-
-@pytest.mark.parametrize(
-    ("changes", "reason", "is_late"),
-    [
-        ({}, "", False),
-        ({"anchor_id": 7}, px4.UNKNOWN_ANCHOR, False),
-        ({"range": math.nan}, px4.NO_RANGE, False),
-        ({"age_s": 200.0}, px4.NO_RANGE, False),
-        ({"variance": math.inf}, px4.NO_VARIANCE, False),
-        ({"age_s": -0.1}, px4.FUTURE, False),
-        ({"age_s": 0.4}, "", True),
-    ],
-)
-def test_each_range_that_ekf2_cannot_use_has_a_reason(changes: dict[str, float], reason: str, is_late: bool):
-    anchors = AnchorMap([Anchor(key, place) for key, place in ANCHORS.items()])
-    node = SimpleNamespace(_anchors=anchors, _unknown=set(), _counts=Counter(), now_ns=lambda: 100 * 10**9)
-    fields = {"anchor_id": 0x022E, "range": 1.0, "variance": 0.01, "age_s": 0.1} | changes
-    stamp_ns = 100 * 10**9 - round(fields.pop("age_s") * 1e9)
-    assert px4.Px4._reason_to_drop(node, RangeCorrected(**fields), stamp_ns) == reason
-    assert node._counts == (Counter({px4.LATE: 1}) if is_late else Counter())
 
 
 def test_invalid_settings_of_ranges_are_named(ros: Ros, px4_msgs: None):

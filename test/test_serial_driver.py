@@ -27,8 +27,7 @@ from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.radios import serial as serial_source
 from uwb_mitigation.radios.port import PortAddress
 from uwb_mitigation.radios.serial import BoardPort, SerialSettings
-from uwb_mitigation.radios.settings import PortMessage, RadioSettings, Role
-from uwb_mitigation.radios.wire.events import Loss
+from uwb_mitigation.radios.settings import RadioSettings, Role
 from uwb_mitigation.radios.wire.framing import FrameEncoder
 from uwb_mitigation.radios.wire.messages import Hello, RadioConfigured
 from uwb_mitigation.simulation.simulated import SimulatedSource
@@ -259,13 +258,3 @@ def test_board_of_another_protocol_version_is_a_problem_that_names_it():
     port._received(FrameEncoder(version=9).encode(1, b""), 0, 0)
     port._received(b"", 4 * 10**9, 0)
     assert port.report().problem == "the board uses another protocol version: 9"
-
-
-def test_loss_of_a_board_is_logged_unless_its_port_is_closed():
-    port = BoardPort(SerialSettings(PortAddress("/dev/no")), (0, None, print, time.time_ns))
-    assert [type(event) for event in port._observed([Loss.RESET])] == [
-        Loss,
-        PortMessage,
-    ]
-    port.request_close()
-    assert [type(event) for event in port._observed([Loss.CLOSED])] == [Loss]

@@ -113,23 +113,6 @@ def test_command_writes_a_bag_marked_as_simulated(tmp_path: Path, like: str) -> 
     assert "--force" in str(again.exception)
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("--like buildings --ranges 30", "a multiple of"),
-        ("--like buildings --exchanges 0", "a multiple of"),
-        ("--channel 6", "unknown channel 6"),
-    ],
-)
-def test_a_part_of_a_placement_or_an_unknown_channel_is_refused(
-    tmp_path: Path, words: str, message: str
-) -> None:
-    done = CliRunner().invoke(app, ["data", "simulate", "-o", str(tmp_path / "sim.mcap"), *words.split()])
-    assert isinstance(done.exception, ParameterError)
-    assert message in str(done.exception)
-    assert not list(tmp_path.iterdir())
-
-
 # --- errors --------------------------------------------------------------------------------
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import astuple
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from model_material import card, dataset, random_weights, windows
 from typer.testing import CliRunner
 
 from uwb_mitigation.commands.cli import app
-from uwb_mitigation.errors import DatasetError, ParameterError
+from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.mitigation.model import floating, graph
 from uwb_mitigation.mitigation.model.architecture import Mlp, Remnet
 from uwb_mitigation.mitigation.model.bundle import Session, load_bundle, save_bundle
@@ -56,11 +57,6 @@ def test_without_levels_the_bias_is_the_median_over_configurations():
     assert linear_bias == LinearBiasModel(1.5)
 
 
-def test_linear_bias_model_without_data_is_refused():
-    with pytest.raises(DatasetError, match="no measurements"):
-        fit_linear_bias(np.array([]), np.array([]), np.array([]), np.array([]))
-
-
 torch = pytest.importorskip("torch", reason="run `make setup-training`")
 from uwb_mitigation.training import train  # noqa: E402
 from uwb_mitigation.training.fit.candidates import Recipe, fit_new_model  # noqa: E402
@@ -87,21 +83,27 @@ def test_network_learns_a_function_of_its_inputs():
     assert left < 0.4 * np.abs(targets - np.median(targets)).mean()
 
 
-def test_inputs_that_are_not_finite_are_refused():
-    with pytest.raises(DatasetError, match="all finite"):
-        fit(SHAPE, np.full((2, 32), np.nan, np.float32), np.zeros(2), FitOptions())
+UNKNOWN = np.full((2, 32), np.nan, np.float32)
+DIVERGING = windows(64, 32) * 1e30, np.full(64, 3e38), FitOptions(epochs=50, learning_rate=1.0)
 
 
-def test_loss_that_diverges_ends_the_training():
-    targets = np.full(64, 3e38)
-    with pytest.raises(DatasetError, match="in epoch"):
-        fit(SHAPE, windows(64, 32) * 1e30, targets, FitOptions(epochs=50, learning_rate=1.0))
-
-
-@pytest.mark.parametrize("change", [{"epochs": 0}, {"learning_rate": 0.0}, {"dropout": 1.0}, {"seed": -1}])
-def test_options_out_of_range_are_refused(change):
-    with pytest.raises(ParameterError, match=next(iter(change))):
-        FitOptions(**change)
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (partial(fit_linear_bias, *[np.array([])] * 4), "no measurements"),
+        (partial(fit, SHAPE, UNKNOWN, np.zeros(2), FitOptions()), "all finite"),
+        (partial(fit, SHAPE, *DIVERGING), "in epoch"),
+        *((partial(FitOptions, **{name: value}), name) for name, value in {
+            "epochs": 0, "learning_rate": 0.0, "dropout": 1.0, "seed": -1,
+        }.items()),
+        *((partial(Mlp, **options), "MLP") for options in (
+            {"samples": 0}, {"hidden": ()}, {"hidden": (0,)}, {"hidden": (1,) * 7},
+        )),
+    ],
+)  # fmt: skip
+def test_data_options_and_shapes_that_cannot_be_trained_are_refused(make: partial, message: str):
+    with pytest.raises(UwbMitigationError, match=message):
+        make()
 
 
 RECIPE = Recipe(SHAPE, FitOptions(epochs=1))
@@ -173,12 +175,6 @@ def test_bundle_loads_and_runs(tmp_path, shape, quantised):
     if not quantised:
         read = graph.float_weights(bundle.model, shape)
         assert all(np.array_equal(weights.weight[name], read.weight[name]) for name in weights.weight)
-
-
-@pytest.mark.parametrize("options", [{"samples": 0}, {"hidden": ()}, {"hidden": (0,)}, {"hidden": (1,) * 7}])
-def test_invalid_mlp_is_refused(options):
-    with pytest.raises(ParameterError, match="MLP"):
-        Mlp(**options)
 
 
 def test_command_writes_both_bundles_with_the_error_by_condition(tmp_path: Path) -> None:

@@ -658,7 +658,7 @@ def test_a_board_that_answers_with_text_is_not_called_mute(line: bytes, text: st
 
 
 @given(st.binary(max_size=600), st.integers(1, 40))
-@settings(max_examples=300)
+@settings(max_examples=100)
 def test_no_bytes_make_a_session_fail(data: bytes, piece: int):
     run = Bench().start()
     good = run.range(1)
