@@ -39,6 +39,7 @@ JUMP_SPEED, JUMP_YAW_RATE = 3.0, 10.0
 _SLIP, _TURN_NOISE = 2.0 * CORRELATION_S * MOTION_SHARE**2, 2.0 * CORRELATION_S * TURN_SHARE**2
 """Variance per second of random errors: of the position for the squared velocity, of the yaw for the squared yaw rate."""
 
+_TIMEOUT_NS = ODOMETRY_TIMEOUT_S * NS_PER_S
 _MAX_VARIANCE = 1e3
 _NUM_SAMPLES = 512
 
@@ -68,13 +69,8 @@ class PathPoint(NamedTuple):
     source: int = 0
 
 
-class _Sample(NamedTuple):
-    stamp_ns: int
-    point: PathPoint
-    rates: tuple[float, ...]
-    """Change of each value of the point per second."""
-    pose: Sequence[float] | None
-    """Pose of the message; None: unknown."""
+_Sample = tuple[int, PathPoint, tuple[float, ...], Sequence[float] | None]
+"""Stamp of a message in ns, point, change of each value of the point per second before it, and pose; None: unknown."""
 
 
 class DeadReckoning:
@@ -123,21 +119,22 @@ class DeadReckoning:
         # A sum is finite if its terms are.
         if pose is not None and not math.isfinite(pose[0] + pose[1] + pose[2]):
             pose = None
-        last = self._samples[-1] if self._samples else None
-        gap_ns = 0 if last is None else stamp_ns - last.stamp_ns
-        if last is not None and -NS_PER_S <= gap_ns <= 0:
+        samples = self._samples
+        last_ns, before, _, last_pose = samples[-1] if samples else (0, None, (), None)
+        gap_ns = stamp_ns - last_ns
+        if before is not None and -NS_PER_S <= gap_ns <= 0:
             self.rejected += 1
             return
         imu_yaw = None if self._imu is None else _yaw_of_imu(stamp_ns, self._imu)
-        if last is None or not 0 < gap_ns <= ODOMETRY_TIMEOUT_S * NS_PER_S:
+        if before is None or not 0 < gap_ns <= _TIMEOUT_NS:
             self._segment += 1
-            self._samples.clear()
-            self._samples.append(_Sample(stamp_ns, PathPoint(self._segment), (0.0,) * 8, pose))
+            samples.clear()
+            samples.append((stamp_ns, PathPoint(self._segment), (0.0,) * 8, pose))
             self._imu_yaw, self.twist = imu_yaw, None
             return
-        dt, before = gap_ns / NS_PER_S, last.point
-        if pose is not None and last.pose is not None:
-            vx, vy, yaw_rate = _twist_of_poses(last.pose, pose, dt, twist)
+        dt = gap_ns / NS_PER_S
+        if pose is not None and last_pose is not None:
+            vx, vy, yaw_rate = _twist_of_poses(last_pose, pose, dt, twist)
             speed = math.hypot(vx, vy)
         of_x, of_y, of_yaw_rate = twist_variance
         of_speed = _known_variance(of_x if of_x > of_y else of_y, SPEED_SD)
@@ -156,7 +153,7 @@ class DeadReckoning:
         east, north = cosine * vx - sine * vy, sine * vx + cosine * vy
         position_density = of_speed * dt + _SLIP * speed * speed
         rates = (east, north, yaw_rate, speed, drift, turn_sd * yaw_rate, position_density, yaw_density)
-        self._samples.append(_Sample(stamp_ns, _moved(before, rates, dt, source), rates, pose))
+        samples.append((stamp_ns, _moved(before, rates, dt, source), rates, pose))
 
     def add_imu(self, stamp_ns: int, yaw_rate: float, variance: float = 0.0, yaw: float = math.nan) -> None:
         """Add a message of an IMU; an invalid one is rejected.
@@ -195,12 +192,12 @@ class DeadReckoning:
         latest = self._before(stamp_ns)
         if latest is None:
             return None
-        sample, rates, dt = latest
-        if sample.pose is None:
+        (_, point, _, pose), rates, dt = latest
+        if pose is None:
             return None
-        x, y, yaw = sample.pose
+        x, y, yaw = pose
         # The frame of the path is another one.
-        turn = yaw - sample.point.yaw
+        turn = yaw - point.yaw
         cosine, sine = math.cos(turn), math.sin(turn)
         dx, dy = rates[0] * dt, rates[1] * dt
         return x + cosine * dx - sine * dy, y + sine * dx + cosine * dy, yaw + rates[2] * dt
@@ -208,13 +205,13 @@ class DeadReckoning:
     def _before(self, stamp_ns: int) -> tuple[_Sample, tuple[float, ...], float] | None:
         """Return the latest sample before a time, the rates after it, and the time since, s."""
         samples = self._samples
-        if not samples or stamp_ns > samples[-1].stamp_ns + ODOMETRY_TIMEOUT_S * NS_PER_S:
+        if not samples or stamp_ns > samples[-1][0] + _TIMEOUT_NS:
             return None
-        rates = samples[-1].rates
+        rates = samples[-1][2]
         for sample in reversed(samples):
-            if sample.stamp_ns <= stamp_ns:
-                return sample, rates, (stamp_ns - sample.stamp_ns) / NS_PER_S
-            rates = sample.rates
+            if sample[0] <= stamp_ns:
+                return sample, rates, (stamp_ns - sample[0]) / NS_PER_S
+            rates = sample[2]
         return None
 
 
@@ -247,17 +244,9 @@ def _twist_of_poses(
 def _moved(point: PathPoint, rates: tuple[float, ...], dt: float, source: int) -> PathPoint:
     """Return the point after a time with constant rates of its values."""
     # Names instead of loops: this runs for each message and each range.
-    segment, x, y, yaw, distance_m, drift, turn, position_variance, yaw_variance, _ = point
+    segment, x, y, yaw, distance_m, drift, turn, of_position, of_yaw, _ = point
     vx, vy, yaw_rate, speed, drift_rate, turn_rate, position_density, yaw_density = rates
-    return PathPoint(
-        segment,
-        x + dt * vx,
-        y + dt * vy,
-        yaw + dt * yaw_rate,
-        distance_m + dt * speed,
-        drift + dt * drift_rate,
-        turn + dt * turn_rate,
-        position_variance + dt * position_density,
-        yaw_variance + dt * yaw_density,
-        source,
-    )
+    x, y, yaw = x + dt * vx, y + dt * vy, yaw + dt * yaw_rate
+    distance_m, drift, turn = distance_m + dt * speed, drift + dt * drift_rate, turn + dt * turn_rate
+    of_position, of_yaw = of_position + dt * position_density, of_yaw + dt * yaw_density
+    return PathPoint(segment, x, y, yaw, distance_m, drift, turn, of_position, of_yaw, source)

@@ -105,7 +105,7 @@ class RangeFilter:
         x, y, z = state.x[:3].tolist()
         x, y, z = x - u, y - v, z - w
         distance = math.sqrt(x * x + y * y + z * z)
-        divisor, H = max(distance, SHORTEST_M), state.H
+        divisor, H = distance if distance > SHORTEST_M else SHORTEST_M, state.H
         H[0], H[1], H[2] = x / divisor, y / divisor, z / divisor
         return state.update_range(anchor, range_m, distance, variance_m2, is_corrected)
 

@@ -123,7 +123,7 @@ class OdometryFilter:
         arm_x, arm_y = self._arm(yaw)
         x, y, z = x + arm_x - u, y + arm_y - v, z + self._lever_arm[2] - w
         distance = math.sqrt(x * x + y * y + z * z)
-        divisor, H = max(distance, SHORTEST_M), state.H
+        divisor, H = distance if distance > SHORTEST_M else SHORTEST_M, state.H
         H[0], H[1], H[2] = x / divisor, y / divisor, z / divisor
         H[YAW] = (y * arm_x - x * arm_y) / divisor
         return state.update_range(anchor, range_m, distance, variance_m2, is_corrected)

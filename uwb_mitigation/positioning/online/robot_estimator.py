@@ -142,14 +142,12 @@ class RobotEstimator:
 
     def predict_at(self, stamp_ns: int) -> Estimate | None:
         """Predict position and heading at a time after the latest range; None: not known."""
-        point, predicted = self.odometry.point_at(stamp_ns), self._heading_filter
-        if predicted is not None and point is not None and point.segment == predicted.point.segment:
-            predicted = predicted.copy()
+        point, latest, predicted = self.odometry.point_at(stamp_ns), self._heading_filter, None
+        if latest is not None and point is not None and point.segment == latest.point.segment:
+            predicted = latest.copy()
             predicted.advance(self.tag.seconds(stamp_ns), point)
             if self._area is not None:
                 predicted.confine(self._area)
-        else:
-            predicted = None
         return self._estimate(self.tag.predicted(stamp_ns), predicted, stamp_ns)
 
     def restart(self, stamp_ns: int | None = None) -> None:
@@ -162,13 +160,11 @@ class RobotEstimator:
         recorded: list[tuple[int, Callable[..., None], Any]] = []
         if (imu := self._robot.imu) is not None:
             rows = rows_of(imu.stamp_ns, imu.yaw_rate, imu.yaw_rate_variance)
-            add_imu = self.odometry.add_imu
-            recorded += [(stamp_ns, add_imu, values) for stamp_ns, *values in rows]
+            recorded += [(stamp_ns, self.odometry.add_imu, values) for stamp_ns, *values in rows]
         if (motion := self._robot.odometry) is not None:
             variance = np.diagonal(motion.twist_covariance, axis1=1, axis2=2)
             rows = rows_of(motion.stamp_ns, motion.pose, motion.twist, variance)
-            add = self.odometry.add
-            recorded += [(stamp_ns, add, values) for stamp_ns, *values in rows]
+            recorded += [(stamp_ns, self.odometry.add, values) for stamp_ns, *values in rows]
         return recorded
 
     def _estimate(
@@ -223,14 +219,13 @@ class RobotEstimator:
             self._start_yaws(point)
             return
         dt = time_s - self._yaws[0].filter.time_s
-        height = None
-        if tag.filter is not None and not tag.filter.is_level:
-            height = tag.filter.state.x.item(2), tag.filter.state.P.item(2, 2)
+        # Its height is copied, unless it is constant.
+        climbing = None if tag.filter is None or tag.filter.is_level else tag.filter.state
         for hypothesis in self._yaws:
             filter_ = hypothesis.filter
             filter_.advance(time_s, point)
-            if height is not None:
-                filter_.set_height(*height)
+            if climbing is not None:
+                filter_.set_height(climbing.x.item(2), climbing.P.item(2, 2))
             z, sd = filter_.update(*measurement[1:])
             if self._area is not None:
                 filter_.confine(self._area)

@@ -274,7 +274,7 @@ class RobustUpdate:
         # The method `dot` and BLAS are faster here than operators.
         product = self.moments.dot(H)
         PH = product[:-1]
-        S = ddot(H, PH) + max(R, MIN_VARIANCE_M2)
+        S = ddot(H, PH) + (R if R > MIN_VARIANCE_M2 else MIN_VARIANCE_M2)
         sd = math.sqrt(S)
         z, product[-1] = innovation / sd, -innovation
         gain = PH

@@ -153,10 +153,6 @@ class TagEstimator:
         if isinstance(measurement, TagHeight):
             self._add_height(measurement)
             return None
-        return self.add_range(measurement)
-
-    def add_range(self, measurement: TagRange) -> Estimate | None:
-        """Update with a valid range; see `add`."""
         published = self.update(measurement)
         return None if published is None else Estimate(measurement.stamp_ns, *self.solution(published))
 
