@@ -50,6 +50,9 @@ MAX_SD_M = 0.5
 MIN_ANCHORS = 3
 MAX_HEADLINE = 60
 """Maximum number of characters of a reason with its explanation."""
+JUMP_S = 60.0
+"""Time for which a jump of a clock is the reason of a position that is missing."""
+SYNCHRONISE = "Synchronise the clocks of the computers (such as with chrony), then restart the locator."
 HOLD_S = 2.0
 """Time for which a better verdict must hold before it is shown."""
 RADIUS95 = math.sqrt(5.991 / 2.0)
@@ -58,6 +61,8 @@ CELLS = 40
 """Width and height of the map of the predicted accuracy, points."""
 STEPS_M = (0.1, 0.2, 0.5, 1.0, 10.0)
 """Upper limits of the colours of the map of the predicted accuracy; above the last one, it is not shown."""
+
+_NO_JUMP = -math.inf, 0.0
 
 Means = Mapping[str, float]
 """Means of a pair or an anchor: `rate` (Hz); `nlos`, `lost`, `not_ok` (%); `residual`, corrected range minus distance to
@@ -187,11 +192,15 @@ def verdict(
     pose = next(iter(scene.tags.values()), None) if tag_id is None else scene.tag_of(tag_id)
     received = [key for key, means in anchors.items() if means["stopped"] == 0.0]
     reason, action = _of_remedy(remedy)
+    jump_at_s, jump_s = scene.incidents.clock_jumps.get(-1 if tag_id is None else tag_id, _NO_JUMP)
+    jumped = scene.clock() - jump_at_s < JUMP_S and f"the clock of {name} jumped by {jump_s:+.0f} s"
     if tag_id is None and pose is None:
         return Verdict(WAITING)
     if ages_s and min(ages_s) > NO_DATA_S:
         reason = f"no ranges of {name} for {min(ages_s):.0f} s"
         return Verdict(LOST, reason, "Check power of the tag, and the driver.")
+    if jumped and (pose is None or scene.age_s(pose) > NO_DATA_S):
+        return Verdict(UNDETERMINED if pose is None else LOST, jumped, SYNCHRONISE)
     if pose is None:
         action = action or "see the notices below"
         silent = sorted(set(scene.anchors).difference(received))

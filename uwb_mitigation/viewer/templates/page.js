@@ -21,11 +21,11 @@ function start(doc) {
   // The next update comes after this one has been drawn: a slow page skips updates instead of showing old ones.
   let received = performance.now();
   const showAge = () => {
-    const player = controls.player, [, took, rangeAge, stampAge] = controls.update ?? [0, 0, -1, null], age = (performance.now() - received) / 1000 + took;
+    const player = controls.player, [, took, rangeAge] = controls.update ?? [0, 0, -1], age = (performance.now() - received) / 1000 + took;
     const late = player?.behind ? "Reading ..." : age > 2 && (player?.playing ?? true) ? `${age.toFixed(0)} s behind`
       : player?.playing && !position && rangeAge < 0 ? "NO RANGES" : "";
     $("age").className = late ? "late" : "";
-    setText($("age"), late || (!player?.playing ? "PAUSED" : position ? "PLAYING" : `LIVE ${(age + rangeAge).toFixed(1)} s${Math.abs(stampAge - rangeAge) > 1 ? `, stamps ${Math.abs(stampAge) < 1e5 ? (age + stampAge).toFixed(1) : "> 1e5"} s old` : ""}`));
+    setText($("age"), late || (!player?.playing ? "PAUSED" : position ? "PLAYING" : `LIVE ${(age + rangeAge).toFixed(1)} s`));
   };
   on("update", () => {
     received = performance.now();
