@@ -285,7 +285,8 @@ def test_map_has_heading_ellipse_and_a_legend_of_what_it_contains():
     page = shown(scene)
 
     def legend() -> set[str]:
-        items = [item for item in page.document.get_model_by_name("map").legend[0].items if item.visible]
+        legends = page.document.get_model_by_name("map").legend
+        items = [item for legend in legends for item in legend.items if item.visible]
         fields = {item.label.field for item in items if hasattr(item.label, "field")}
         return {value for field in fields for value in page.column("map", field)} | {
             item.label.value for item in items if hasattr(item.label, "value")

@@ -31,7 +31,7 @@ from uwb_mitigation.viewer.scene import (
     plain_tag_id,
     tag_label,
 )
-from uwb_mitigation.viewer.state import PageState, columns_of, drawable, new_source, set_rows
+from uwb_mitigation.viewer.state import PageState, columns_of, new_source, set_rows
 
 HEADINGS = {
     "map": "Map",
@@ -297,8 +297,8 @@ class Map:
         # The map shows these corners until the user changes the view; it must not follow the data.
         self._extent = new_source("x", "y")
         self.plot = plot = new_figure("map", "x, m", "y, m", HEIGHT, match_aspect=True)
-        # Fixed borders: tick labels of another width would resize the frame and change the view.
-        plot.min_border_left, plot.min_border_right = 70, 20
+        # Fixed borders: tick labels of another width, or a second row of the legend, would change frame and view.
+        plot.min_border_left, plot.min_border_right, plot.min_border_top = 70, 20, 46
         extent = plot.scatter("x", "y", source=self._extent, size=0, alpha=0)
         plot.x_range, plot.y_range = DataRange1d(renderers=[extent]), DataRange1d(renderers=[extent])
         for glyph, source, style in self._layers():
@@ -306,6 +306,11 @@ class Map:
         named = [r for r in plot.renderers if isinstance(r.glyph, models.Text)]
         tips = [("", "@name"), ("x, y", "@x{0.00}, @y{0.00} m")]
         plot.add_tools(models.HoverTool(tooltips=tips, renderers=named))
+        # States have a legend of their own, whose height never changes; a report without ranges has no states.
+        (legend,), has_states = plot.legend, math.isfinite(page.trail_s) or len(page.view.scene.pairs) > 0
+        states = [item for item in legend.items if getattr(item.label, "value", "") in health.LOOKS]
+        self._items = legend.items = [item for item in legend.items if item not in states]
+        plot.add_layout(models.Legend(items=states, visible=has_states), "below")
         finish(plot)
 
     def _layers(self) -> list[tuple[str, ColumnDataSource, dict[str, Any]]]:
@@ -323,7 +328,7 @@ class Map:
             )
             for x, y, align in _SIDES
         ]  # fmt: skip
-        # The legend has all states, whatever the anchors have; it needs data, which are nowhere.
+        # The legend has all states, whatever the anchors have: it needs data, which are nowhere.
         nowhere, anchors = ColumnDataSource({"x": [math.nan], "y": [math.nan]}), []
         for state, (marker, colour) in health.LOOKS.items():
             outline = GREY if state == health.SILENT else NIGHT
@@ -373,12 +378,10 @@ class Map:
             self._fitted = fitted
             self.fit(scene)
         # The legend shows only what the map contains.
-        for item in self.plot.legend[0].items:
-            data, name = item.renderers[0].data_source.data, getattr(item.label, "value", "")
-            column = _OPTIONAL.get(name)
+        for item in self._items:
+            data = item.renderers[0].data_source.data
+            column = _OPTIONAL.get(getattr(item.label, "value", ""))
             item.visible = bool(np.isfinite(data[column]).any() if column else len(next(iter(data.values()))))
-            # A map without ranges, such as that of a calibration, shows no states.
-            item.visible &= name not in health.LOOKS or len(scene.pairs) > 0
 
     def _draw_anchors(self, scene: Scene) -> None:
         page, displaced, rows = self._page, self._page.view.timeline.displaced, []
@@ -410,9 +413,9 @@ class Map:
             age_s, name, colour = scene.age_s(pose), tag_label(tag, plain_id), colours[tag]
             if age_s > NO_DATA_S:
                 name, colour = f"{name}: no data for {age_s:.0f} s", GREY
-            major, minor, angle = map(drawable, pose.ellipse)
-            ellipse = 2 * major, 2 * minor, angle
-            rows.append((pose.x, pose.y, name, colour, *ellipse, pose.heading_rad))
+            # A huge one would make all others invisible.
+            major, minor, angle = pose.ellipse if pose.ellipse[0] < MAX_RANGE_M else (math.nan,) * 3
+            rows.append((pose.x, pose.y, name, colour, 2 * major, 2 * minor, angle, pose.heading_rad))
         set_rows(self._tags, rows)
 
     def _draw_tracks(self, scene: Scene) -> None:

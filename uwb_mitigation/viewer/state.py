@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -12,7 +11,7 @@ from bokeh.model import DataModel
 from bokeh.models import ColumnDataSource
 
 from uwb_mitigation.types.measurement import Cir
-from uwb_mitigation.viewer.histories import HISTORY_S, MAX_RANGE_M, History, Pair
+from uwb_mitigation.viewer.histories import HISTORY_S, History, Pair
 from uwb_mitigation.viewer.scene import Scene, Timeline
 
 if TYPE_CHECKING:
@@ -117,10 +116,8 @@ class PageState:
 
     def changed(self, name: str, value: object) -> bool:
         """Return whether a value differs from that of the last call."""
-        if name in self._drawn and self._drawn[name] == value:
-            return False
-        self._drawn[name] = value
-        return True
+        before, self._drawn[name] = self._drawn.get(name, self), value
+        return before != value
 
     def forget(self, name: str) -> None:
         """Let the next call of `changed` return True."""
@@ -147,8 +144,3 @@ def set_rows(source: ColumnDataSource, rows: Sequence[Sequence[Any]]) -> None:
     """Set the rows of a source, which contain no arrays, if they have changed."""
     if (columns := columns_of(source, rows)) != source.data:
         source.data = columns
-
-
-def drawable(value_m: float) -> float:
-    """Return NaN for a length that would make all others invisible."""
-    return value_m if abs(value_m) < MAX_RANGE_M else math.nan

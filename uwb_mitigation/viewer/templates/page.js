@@ -136,9 +136,8 @@ function start(doc) {
   if (matchMedia("(pointer: coarse)").matches)
     for (const figure of figures) for (const tool of figure.toolbar.tools) if (tool.event_types?.includes("pan")) tool.active = false;
 
-  const legend = (figure) => [...figure.above, ...figure.below].find((part) => part.items);
-  for (const figure of figures) if (legend(figure)) new ResizeObserver(([{contentRect: {width}}]) => {
-    legend(figure).ncols = Math.max(2, Math.floor((width - 40) / 110));
+  for (const figure of figures) new ResizeObserver(([{contentRect: {width}}]) => {
+    for (const part of [...figure.above, ...figure.below]) if (part.items) part.ncols = Math.max(2, Math.floor((width - 40) / 110));
   }).observe($(figure.name));
 
   $("map").addEventListener("click", (event) => {
