@@ -51,7 +51,7 @@ MIN_ANCHORS = 3
 MAX_HEADLINE = 60
 """Maximum number of characters of a reason with its explanation."""
 JUMP_S = 60.0
-"""Time for which a jump of a clock is the reason of a position that is missing."""
+"""Time for which a jump of a clock is the reason for a missing position; of a lost one, until it is back."""
 SYNCHRONISE = "Synchronise the clocks of the computers (such as with chrony), then restart the locator."
 HOLD_S = 2.0
 """Time for which a better verdict must hold before it is shown."""
@@ -192,15 +192,18 @@ def verdict(
     pose = next(iter(scene.tags.values()), None) if tag_id is None else scene.tag_of(tag_id)
     received = [key for key, means in anchors.items() if means["stopped"] == 0.0]
     reason, action = _of_remedy(remedy)
-    jump_at_s, jump_s = scene.incidents.clock_jumps.get(-1 if tag_id is None else tag_id, _NO_JUMP)
-    jumped = scene.clock() - jump_at_s < JUMP_S and f"the clock of {name} jumped by {jump_s:+.0f} s"
     if tag_id is None and pose is None:
         return Verdict(WAITING)
     if ages_s and min(ages_s) > NO_DATA_S:
         reason = f"no ranges of {name} for {min(ages_s):.0f} s"
         return Verdict(LOST, reason, "Check power of the tag, and the driver.")
-    if jumped and (pose is None or scene.age_s(pose) > NO_DATA_S):
-        return Verdict(UNDETERMINED if pose is None else LOST, jumped, SYNCHRONISE)
+    jump_at_s, jump_s = scene.incidents.clock_jumps.get(-1 if tag_id is None else tag_id, _NO_JUMP)
+    # The last positions before a jump may arrive after it.
+    is_lost = pose is not None and scene.age_s(pose) > NO_DATA_S
+    begin_s = scene.clock() - JUMP_S if pose is None else pose.received_s - NO_DATA_S
+    if (pose is None or is_lost) and jump_at_s > begin_s:
+        reason = f"the clock of {name} jumped by {jump_s:+.0f} s"
+        return Verdict(LOST if is_lost else UNDETERMINED, reason, SYNCHRONISE)
     if pose is None:
         action = action or "see the notices below"
         silent = sorted(set(scene.anchors).difference(received))
@@ -210,7 +213,7 @@ def verdict(
             reason = f"only {senders} ranges; no ranges from {missing}" + (", ..." if silent[6:] else "")
             action = f"Find out why: check power, PAN id, and ids in the anchors file. Without them: {action}"
         return Verdict(UNDETERMINED, reason or f"no position of {name}", _sentence(action))
-    if scene.age_s(pose) > NO_DATA_S:
+    if is_lost:
         reason = f"no position of {name} for {scene.age_s(pose):.0f} s"
         return Verdict(LOST, reason, _sentence(remedy or "Drive into the area of the anchors"))
     sd_m = pose.sd_m
