@@ -20,7 +20,7 @@ from benchmarks.equipment.page_clients import PageClients
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.types.anchors import Anchor
 from uwb_mitigation.types.measurement import Cir, Encoding, Status
-from uwb_mitigation.viewer.histories import Sample, Trace
+from uwb_mitigation.viewer.histories import Sample
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.scene import NodeStatus, Pose, Scene
 from uwb_mitigation.viewer.server import ViewerServer
@@ -50,11 +50,11 @@ def view(clock: Clock) -> View:
             magnitude = np.full(200, 10, np.int16)
             magnitude[20:40] = 1000 * anchor
             cir = Cir(magnitude, Encoding.MAGNITUDE, 730, 750.4, noise_threshold=120)
-            scene.set_trace((anchor, 7), Trace(cir))
+            scene.set_cir((anchor, 7), cir)
             status = Status.OK if anchor == 1 else Status.OUT_OF_DISTRIBUTION
             true_m, range_m = (5.1, 5.1) if anchor == 1 else (4.8, 5.3)
             scene.add_sample((anchor, 7), Sample(time_s, 5.3, range_m, 0.1, status, true_m))
-        scene.add_position(HOSTILE, TrackKind.TRUE, (time_s, 4.0, 3.0, 1.0, math.nan))
+        scene.add_pose(HOSTILE, Pose(4.0, 3.0, 1.0, stamp_s=time_s), TrackKind.TRUE)
         scene.add_pose("tag", Pose(4 + math.sin(step / 20), 3, 1, (0.4, 0.2, 0.3), stamp_s=time_s))
     return view
 
@@ -194,7 +194,7 @@ def test_implausible_values_do_not_break_the_page(browser: Browser, view: View, 
             view.scene.add_sample((anchor, 7), Sample(1005.0, *values, Status.BAD_CIR, 5.0))
         view.scene.add_pose("tag", Pose(4, 3, nan, (1e300, nan, nan)))
         view.scene.add_pose("tag", Pose(1e300, 3, 0))
-        view.scene.add_position("tag", TrackKind.TRUE, (1005.0, 4.0, -1e300, 0.0, math.nan))
+        view.scene.add_pose("tag", Pose(4.0, -1e300, 0.0, stamp_s=1005.0), TrackKind.TRUE)
     open_page(browser, server)
     assert browser.console_messages() == []
     shown = [cell for row in browser.table("Pairs") for cell in row.values() if "e+" in cell]

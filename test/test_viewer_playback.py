@@ -105,8 +105,8 @@ def test_seek_shows_data_up_to_the_position(bag: Path):
             ("tag_9", TrackKind.CORRECTED): last // 10 + 1,
             ("tag_7", TrackKind.TRUE): last // 10 + 1,
         }
-    assert player.read_trace((2, 7)) is None
-    assert player.read_trace((1, 7)).cir.samples.tolist() == record(0).measurement.cir.samples.tolist()
+    assert player.read_cir((2, 7)) is None
+    assert player.read_cir((1, 7)).samples.tolist() == record(0).measurement.cir.samples.tolist()
     assert scene.errors == COUNT, "the truth is joined, and nothing is counted twice"
 
 
@@ -189,7 +189,7 @@ def test_output_of_track_is_shown(tmp_path: Path):
     assert any("0x1122334455667788" in name for name in scene.tags)
     for view in scene.tracks.values():
         assert view.rows[-1, 1:3] == pytest.approx(truth.position[-1, :2], abs=0.5)
-    assert "without ranges" in player.missing.ranges
+    assert "without ranges" in scene.missing["ranges"]
     written = load_anchors(anchors_path(track)).anchors
     assert [(anchor.id, anchor.position) for anchor in written] == [(a.id, a.position) for a in HALL.anchors]
 

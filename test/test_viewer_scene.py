@@ -14,7 +14,7 @@ from uwb_mitigation.positioning.online.tag_estimator import TagEstimator
 from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.measurement import Cir, Encoding, Status
 from uwb_mitigation.viewer.headline import cards
-from uwb_mitigation.viewer.histories import Sample, Trace
+from uwb_mitigation.viewer.histories import Sample, plausible_cir
 from uwb_mitigation.viewer.palette import NIGHT, PAPER, STATUS_LOOKS, TRACK_STYLES, TrackKind
 from uwb_mitigation.viewer.scene import MAX_PAIRS, Pose, Scene
 from uwb_mitigation.viewer.state import View
@@ -275,7 +275,7 @@ def test_figures_are_those_of_the_selected_tag() -> None:
         scene.add_sample((1, tag), Sample(1000.0, 5.3, 5.1, 0.1, Status.OK))
         for step in range(20):
             time_s = 1000.0 + step / 10
-            scene.add_position(f"tag_{tag}", TrackKind.TRUE, (time_s, step / 10, 0.0, 0.0, math.nan))
+            scene.add_pose(f"tag_{tag}", Pose(step / 10, 0.0, 0.0, stamp_s=time_s), TrackKind.TRUE)
             scene.add_pose(name, Pose(step / 10, error_m, 0.0, stamp_s=time_s, sd_m=0.2))
     for tag, expected in ((7, "0.100 m"), (9, "0.500 m")):
         assert cards(View(scene), tag)[0] == ["Position RMSE, last 60 s", expected, ""]
@@ -293,4 +293,4 @@ def test_figures_are_those_of_the_selected_tag() -> None:
 )  # fmt: skip
 def test_implausible_cir_is_not_shown(scale: float, first_path: float, count: int) -> None:
     cir = Cir(np.full(count, 30_000, np.int16), Encoding.MAGNITUDE, 730, first_path, scale=scale)
-    assert Trace.from_cir(cir) is None
+    assert plausible_cir(cir) is None

@@ -219,8 +219,8 @@ def test_radio_without_cirs_is_a_normal_state():
 def test_correction_has_a_figure_only_if_ranges_were_corrected(status: Status):
     scene, clock = driven({1: 0.3}, status)
     for tenth in range(-30, 1):
-        place = clock.now_s + 900.0 + tenth / 10, 4.1, 3.0, 0.0, math.nan
-        scene.add_position("tag_7", TrackKind.TRUE, place)
+        place = Pose(4.1, 3.0, 0.0, stamp_s=clock.now_s + 900.0 + tenth / 10)
+        scene.add_pose("tag_7", place, TrackKind.TRUE)
     assert ("Correction, last 60 s" in shown(scene).cards()) == (status is Status.OK)
 
 
@@ -271,27 +271,29 @@ def test_pairs_tags_and_nodes_without_data_are_marked():
         ["locator", "STALE", "no diagnostics for 12 s; last: "],
         ["recording", "ERROR", "damaged"],
     ]
-    assert page.controls.notice == ["No ranges for 12 s."]
+    assert page.controls.headline == "Position lost: no ranges of tag 7 for 12 s"
+    assert page.controls.notice == []
     assert page.controls.health[0][-1].startswith("No anchor answers: check the tag")
     scene.add_sample((1, 7), Sample(clock.now_s + 900.0, 5.0, 5.0, 0.1, Status.OK))
     page.send("draw")
     assert page.column("pairs", "status")[0] == "OK"
-    assert "No ranges for 12 s." not in page.controls.notice
 
 
 def test_map_has_heading_ellipse_and_a_legend_of_what_it_contains():
     scene, _ = driven()
-    scene.add_position("tag_7", TrackKind.TRUE, (1000.0, 4.0, 3.0, 0.0, math.nan))
+    scene.add_pose("tag_7", Pose(4.0, 3.0, 0.0, stamp_s=1000.0), TrackKind.TRUE)
     page = shown(scene)
 
     def legend() -> set[str]:
-        items = [item for item in page.document.get_model_by_name("map").legend[0].items if item.visible]
+        legends = page.document.get_model_by_name("map").legend
+        items = [item for legend in legends for item in legend.items if item.visible]
         fields = {item.label.field for item in items if hasattr(item.label, "field")}
         return {value for field in fields for value in page.column("map", field)} | {
             item.label.value for item in items if hasattr(item.label, "value")
         }
 
-    assert legend() == {"raw", "corrected", "true", "OK", "anchor", "selected anchor", "tag"}
+    assert legend() == {"raw", "corrected", "true", "OK", "tag", *health.LOOKS}
+    assert page.column("map", "ink") == [palette.PAPER, *[palette.NIGHT] * 3], "the selected anchor"
     scene.add_pose("tag_7", Pose(4, 3, 1, (0.4, 0.2, 0.3), 0.5, stamp_s=1003.0))
     page.send("draw")
     assert legend() >= {"95 % ellipse", "heading"}
@@ -346,12 +348,33 @@ def test_clock_jump_dead_tag_and_old_stamps_are_reported():
             scene.add_sample((anchor, 7), Sample(clock.now_s + 4500.0, 5.0, 5.0, 0.1, Status.OK))
     page = controls(scene)
     assert page.incidents == [(None, "0 s ago: clock of tag 7: jump by +3600 s")]
-    assert [(row[0], row[-1]) for row in page.tag_rows] == [("tag 7", "-3600.0 s"), ("tag 9", "11.9 s")]
+    assert "last range -3600.0 s old by stamp" in page.verdict[3]
     clock.now_s += 5.0
     scene.add_sample((1, 7), Sample(clock.now_s + 4500.0, 5.0, 5.0, 0.1, Status.OK))
     page = controls(scene)
     assert (None, "5 s ago: tag 9: lost") in page.incidents
-    assert page.tag_rows[1][4:] == ["no position", "0.0", "16.9 s"]
+    assert page.tag_rows[1][4:] == ["no position", "0.0"]
+
+
+@pytest.mark.parametrize(("has_position", "state"), [(True, "lost"), (False, "not determined")])
+def test_jump_of_a_clock_is_the_reason_of_a_missing_position(has_position: bool, state: str):
+    scene, clock = driven()
+    if not has_position:
+        scene.tags.clear()
+    for _ in range(40):
+        clock.now_s += 0.1
+        for anchor in ANCHORS:
+            scene.add_sample((anchor, 7), Sample(clock.now_s + 4500.0, 5.0, 5.0, 0.1, Status.OK))
+    verdict = controls(scene).verdict
+    assert verdict[:2] == [state, "the clock of tag 7 jumped by +3600 s"]
+    assert verdict[2].startswith("Synchronise the clocks")
+    clock.now_s += 90.0
+    scene.add_sample((1, 7), Sample(clock.now_s + 4500.0, 5.0, 5.0, 0.1, Status.OK))
+    assert ("clock" in controls(scene).verdict[1]) == has_position, "until the position is back"
+    scene.add_pose("tag_7", Pose(4.0, 3.0, 0.0, stamp_s=clock.now_s + 4500.0, sd_m=0.1))
+    clock.now_s += 4.0
+    scene.add_sample((1, 7), Sample(clock.now_s + 4500.0, 5.0, 5.0, 0.1, Status.OK))
+    assert controls(scene).verdict[:2] == ["lost", "no position of tag 7 for 4 s"]
 
 
 @pytest.mark.parametrize(
@@ -379,11 +402,13 @@ def test_jump_of_a_position_is_an_event_and_motion_is_not():
     assert incidents.latest == [(6.0, "position of tag 7: jump by 3.5 m")]
 
 
-def test_badge_has_the_age_by_reception_and_by_stamp():
+def test_badge_has_the_age_by_reception_and_the_verdict_that_by_stamp():
     scene, clock = driven()
     scene.stamp_clock = lambda: clock.now_s + 909.6
     clock.now_s += 2.1
-    assert controls(scene).update[2:] == pytest.approx([2.1, 11.7])
+    page = controls(scene)
+    assert page.update[2:] == pytest.approx([2.1])
+    assert "last range 11.7 s old by stamp" in page.verdict[3]
 
 
 def test_control_without_effect_is_disabled():

@@ -28,7 +28,7 @@ from uwb_mitigation.types.ros import topics
 from uwb_mitigation.types.ros.topics import relative
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.viewer.feed import SceneUpdater
-from uwb_mitigation.viewer.scene import DEFAULT_TAG, MAX_TAGS, MissingData, Scene
+from uwb_mitigation.viewer.scene import DEFAULT_TAG, MAX_TAGS, Scene
 from uwb_mitigation.viewer.server import ViewerServer
 from uwb_mitigation.viewer.state import View
 
@@ -165,7 +165,7 @@ class Viewer(ManagedNode):
             self.count_publishers(self.resolve_topic_name(topics.RANGE_CORRECTED)) == 1
         )
         if self._view is not None:
-            self._view.missing = self._missing()
+            self._scene.missing = self._missing()
         # Subscribe to CIRs on demand: they are most of the traffic, and a pipeline publishes them only if subscribed.
         if self._view is not None and self._view.pages:
             self._subscribe_ranges(RangeCir, topics.RANGE_RAW)
@@ -178,7 +178,7 @@ class Viewer(ManagedNode):
             if (match := tag_topic.fullmatch(topic)) and len(self._subscribed) < MAX_TAGS:
                 self._subscribe(PoseWithCovarianceStamped, topic, topics.POSE, match[1])
 
-    def _missing(self) -> MissingData:
+    def _missing(self) -> dict[str, str]:
         """Return the reasons for an empty page, such as a node that is not running."""
         raw, corrected, anchors, poses = (
             self.resolve_topic_name(relative(topic))
@@ -190,10 +190,8 @@ class Viewer(ManagedNode):
             ranges = f"No ranges received: {raw} has a publisher, {corrected} has none. Start the mitigator."
         else:
             ranges = f"No ranges received: {raw} and {corrected} have no publisher. Start the driver and the mitigator."
-        return MissingData(
-            ranges=ranges,
-            anchors=f"No anchor positions: nothing received on {anchors}. Start the locator, or set the parameter anchors.",
-            positions="No tag positions yet: see the diagnostics of the locator."
-            if self.count_publishers(poses)
-            else f"No tag positions: {poses} has no publisher. Start the locator.",
-        )
+        positions = f"No tag positions: {poses} has no publisher. Start the locator."
+        if self.count_publishers(poses):
+            positions = "No tag positions yet: see the diagnostics of the locator."
+        no_anchors = f"No anchor positions: nothing received on {anchors}. Start the locator, or set the parameter anchors."
+        return {"ranges": ranges, "anchors": no_anchors, "positions": positions}

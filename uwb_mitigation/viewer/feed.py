@@ -28,7 +28,7 @@ from uwb_mitigation.types.ros.codec import (
     measurement_key,
 )
 from uwb_mitigation.types.stamps import NS_PER_S, to_ns
-from uwb_mitigation.viewer.histories import BoundedDict, Sample, Trace
+from uwb_mitigation.viewer.histories import BoundedDict, Sample, plausible_cir
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.scene import DEFAULT_TAG, NodeStatus, Pose, Scene
 
@@ -90,8 +90,8 @@ class SceneUpdater:
     def measurement(self, measurement: RangeMeasurement) -> None:
         levels = measurement.cir.power_gap_db, measurement.cir.rx_power_dbm
         self._levels.add(measurement_key(measurement), levels)
-        if (trace := Trace.from_cir(measurement.cir)) is not None:
-            self.scene.set_trace((measurement.anchor_id, measurement.tag_id), trace)
+        if (cir := plausible_cir(measurement.cir)) is not None:
+            self.scene.set_cir((measurement.anchor_id, measurement.tag_id), cir)
 
     def truth(self, key: MeasurementKey, truth: Truth) -> None:
         if key in self._without_truth:
@@ -124,12 +124,10 @@ class SceneUpdater:
         covariance = np.asarray(message.pose.covariance, np.float64).reshape(6, 6)
         variance, heading_rad = float(covariance[0, 0] + covariance[1, 1]), math.nan
         sd_m = math.sqrt(variance) if 0.0 < variance < math.inf else math.nan
-        if kind is not TrackKind.CORRECTED:
-            self.scene.add_position(tag, kind, (stamp_s, x, y, z, sd_m))
-            return
         if 0.0 < covariance[5, 5] < MAX_HEADING_VARIANCE:
             heading_rad = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
-        self.scene.add_pose(tag, Pose(x, y, z, horizontal_ellipse(covariance), heading_rad, stamp_s, sd_m))
+        pose = Pose(x, y, z, horizontal_ellipse(covariance), heading_rad, stamp_s, sd_m)
+        self.scene.add_pose(tag, pose, kind)
 
     def markers(self, message: Any) -> None:
         """Add the anchors of a visualization_msgs/MarkerArray."""

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 from bokeh import models
 from bokeh.core.properties import value
-from bokeh.models import BooleanFilter, CDSView, ColumnDataSource, DataRange1d, Range1d
+from bokeh.models import BooleanFilter, CDSView, ColumnDataSource, DataRange1d, GroupFilter, Range1d
 from bokeh.palettes import cividis
 from bokeh.plotting import figure
 from bokeh.plotting.contour import contour_data
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
-from uwb_mitigation.types.measurement import FAULTS, Status
+from uwb_mitigation.types.measurement import FAULTS, Encoding, Status
 from uwb_mitigation.viewer import health, palette
 from uwb_mitigation.viewer.headline import Positions
 from uwb_mitigation.viewer.histories import HISTORY_S, MAX_RANGE_M, NO_DATA_S
@@ -30,7 +31,7 @@ from uwb_mitigation.viewer.scene import (
     plain_tag_id,
     tag_label,
 )
-from uwb_mitigation.viewer.state import PageState, drawable, new_source, set_rows
+from uwb_mitigation.viewer.state import PageState, columns_of, new_source, set_rows
 
 HEADINGS = {
     "map": "Map",
@@ -51,7 +52,6 @@ TRACE_BEFORE, TRACE_AFTER = 20, 180  # samples before and after the first path
 HEIGHT = 380  # of the map, pixels, so that it is on the first screen
 HEADING_M = 1.0  # length of the line that shows the heading of a tag
 MAX_LABEL = 20  # characters of a name on the map
-RING = 24.0  # diameter of the ring around the selected anchor, pixels
 MARGIN_M = 5.0  # around a tag on a map without anchors
 RANGE_SD_M = 0.1  # for the predicted accuracy if ranges have no standard deviation
 
@@ -62,7 +62,7 @@ _SIDES = (0, -13, "center"), (14, 7, "left"), (-14, 7, "right"), (0, 28, "center
 """Places of a name above, right, left and below of its mark: offsets (pixels) and alignment."""
 
 _OPTIONAL = {
-    "95 % ellipse": "width", "heading": "heading", "selected anchor": "ring", "where its ranges fit": "fit_x",
+    "95 % ellipse": "width", "heading": "heading", "where its ranges fit": "fit_x",
 }  # fmt: skip
 """Layers of the map, and their columns that are NaN where they have nothing to show."""
 
@@ -118,11 +118,13 @@ class Chart:
         raise NotImplementedError
 
     def fill(self, table: NDArray[np.float64], message: str, source: ColumnDataSource | None = None) -> None:
-        """Set the columns of a source; a message, in place of missing data."""
-        source = source or self.source
+        """Set the columns of a source if they have changed; a message, in place of missing data."""
+        source, columns = source or self.source, table.T.astype(np.float32)
         # Before the data go: an axis needs data or corners at any moment.
         self._corners.visible |= bool(message)
-        source.data = dict(zip(source.data, table.T.astype(np.float32), strict=True))
+        before = [np.asarray(column, np.float32) for column in source.data.values()]
+        if not all(map(partial(np.array_equal, equal_nan=True), columns, before)):
+            source.data = dict(zip(source.data, columns, strict=True))
         self._corners.visible = bool(message)
         self.page.set(empty=self.page.controls.empty | {self.plot.name: message})
 
@@ -139,9 +141,6 @@ class Strip(Chart):
 
     def draw(self, scene: Scene) -> None:
         page, now_s = self.page, scene.now_s(self.page.tag_id)
-        # Also draw a pair without new data, because its ranges age.
-        if not page.changed("strip", (page.selected, now_s, scene.ranges)):
-            return
         ranges = page.history.columns
         columns = ranges.stamp_s - now_s, ranges.raw_m, ranges.corrected_m, ranges.true_m, ranges.status
         table = np.column_stack(columns)[ranges.stamp_s >= now_s - HISTORY_S]
@@ -175,7 +174,7 @@ class Quality(Chart):
         page = self.page
         now_s = scene.clock() if page.view.player is None else 0.0
         # All of it moves every second.
-        if page.changed("history", (page.selected, math.floor(now_s), page.view.complete is None)):
+        if page.changed("history", (page.selected, math.floor(now_s), page.view.timeline.is_complete)):
             history = page.view.all_data.pairs.get(page.selected or (-1, -1)) or page.history
             table = history.quality() - (now_s, 0.0, 0.0, 0.0)
             message = "" if np.isfinite(table[:, 1]).any() else "No residuals of this pair yet."
@@ -196,7 +195,7 @@ class PositionErrors(Chart):
     def draw(self, scene: Scene) -> None:
         page, is_live = self.page, self.page.view.player is None
         live_s = math.floor(scene.clock()) if is_live else -1
-        if not page.changed("positions", (page.tag_id, page.view.complete is None, live_s)):
+        if not page.changed("positions", (page.tag_id, page.view.timeline.is_complete, live_s)):
             return
         positions = Positions(page.view, page.tag_id)
         table, raw = (positions.error_columns(kind) for kind in (TrackKind.CORRECTED, TrackKind.RAW))
@@ -224,23 +223,24 @@ class LastCir(Chart):
 
     def draw(self, scene: Scene) -> None:
         page = self.page
-        trace, player = page.trace, page.view.player
+        cir = page.cir
         message = ""
-        if trace is None:
+        if cir is None:
             message = "No CIRs: the source sends none, or no raw ranges are received."
-            if any(history.trace for history in scene.pairs.values()) or (player and player.timeline.cirs_ns):
+            if page.view.timeline.cirs_ns or any(history.cir for history in scene.pairs.values()):
                 message = "No CIR of this pair yet."
-        # Compare the trace instead of its stamp, because stamps may be equal.
-        if not page.changed("cir", (page.selected, trace, message)):
-            return
         marks, table = [], np.zeros((0, 2))
-        if trace is not None:
-            cir = trace.cir
-            sample = np.arange(len(trace.magnitude)) + (cir.start_index - trace.origin)
-            first = finite_or_zero(cir.first_path_index - trace.origin)
+        if cir is not None:
+            magnitude = cir.samples.astype(np.float32)
+            if cir.encoding is Encoding.COMPLEX_INT16:
+                magnitude = np.hypot(magnitude[0::2], magnitude[1::2])
+            is_known = math.isfinite(cir.first_path_index)
+            origin = math.floor(cir.first_path_index) if is_known else cir.start_index
+            sample = np.arange(len(magnitude)) + (cir.start_index - origin)
+            first = finite_or_zero(cir.first_path_index - origin)
             marks = [(cir.noise_threshold, first, -WINDOW_LEAD, page.view.window - WINDOW_LEAD)]
             is_shown = (sample >= -TRACE_BEFORE) & (sample < TRACE_AFTER)
-            table = np.column_stack([sample, trace.magnitude])[is_shown]
+            table = np.column_stack([sample, magnitude * np.float32(cir.scale)])[is_shown]
             message = "" if len(table) else "This CIR has no samples near its first path."
         set_rows(self._marks, marks)
         self.fill(table, message)
@@ -269,8 +269,6 @@ class RangeErrors(Chart):
         self.distribution = Chart(page, plot, source, shares)
 
     def draw(self, scene: Scene) -> None:
-        if not self.page.changed("errors", scene.errors):
-            return
         counts = scene.error_counts
         shares = 100.0 * np.cumsum(counts, axis=1) / np.maximum(counts.sum(axis=1, keepdims=True), 1)
         table = np.stack([ERROR_EDGES_M[1:], ERROR_EDGES_M[:-1], *counts, *shares], axis=1)
@@ -289,7 +287,9 @@ class Map:
         self.shows_accuracy = False
         self._page, self._fitted = page, (False, False, False)
         # Glyphs with NaN are not drawn: without a heading, for example.
-        self._anchors = new_source("x", "y", "name", "id", "health", "label", "ring", "fit_x", "fit_y")
+        self._anchors = new_source(
+            "x", "y", "name", "id", "health", "label", "ink", "paper", "fit_x", "fit_y"
+        )
         self._tags = new_source("x", "y", "name", "colour", "width", "height", "angle", "heading")
         self._tracks = new_source("xs", "ys", "colour", "line_width", "dash", "kind")
         self._rays = new_source("x", "y", "x0", "y0", "x1", "y1", "status")
@@ -297,8 +297,8 @@ class Map:
         # The map shows these corners until the user changes the view; it must not follow the data.
         self._extent = new_source("x", "y")
         self.plot = plot = new_figure("map", "x, m", "y, m", HEIGHT, match_aspect=True)
-        # Fixed borders: tick labels of another width would resize the frame and change the view.
-        plot.min_border_left, plot.min_border_right = 70, 20
+        # Fixed borders: tick labels of another width, or a second row of the legend, would change frame and view.
+        plot.min_border_left, plot.min_border_right, plot.min_border_top = 70, 20, 46
         extent = plot.scatter("x", "y", source=self._extent, size=0, alpha=0)
         plot.x_range, plot.y_range = DataRange1d(renderers=[extent]), DataRange1d(renderers=[extent])
         for glyph, source, style in self._layers():
@@ -306,22 +306,36 @@ class Map:
         named = [r for r in plot.renderers if isinstance(r.glyph, models.Text)]
         tips = [("", "@name"), ("x, y", "@x{0.00}, @y{0.00} m")]
         plot.add_tools(models.HoverTool(tooltips=tips, renderers=named))
+        # States have a legend of their own, whose height never changes; a report without ranges has no states.
+        (legend,), has_states = plot.legend, math.isfinite(page.trail_s) or len(page.view.scene.pairs) > 0
+        states = [item for item in legend.items if getattr(item.label, "value", "") in health.LOOKS]
+        self._items = legend.items = [item for item in legend.items if item not in states]
+        plot.add_layout(models.Legend(items=states, visible=has_states), "below")
         finish(plot)
 
     def _layers(self) -> list[tuple[str, ColumnDataSource, dict[str, Any]]]:
         """Return the layers of the map, the lowest first: glyph, source and style."""
-        marks, (marker, colour) = status_marks(), marks_of("health", health.LOOKS)
-        outline = factor_cmap("health", [GREY], [health.SILENT], nan_color=NIGHT)
+        marks = status_marks()
         # The script of the page selects the side of each name; without it, names are above.
         names = [
             ("text", source, {
-                "text": column, "text_font_size": "12px", "text_color": NIGHT, "x_offset": x, "y_offset": y, "text_align": align,
-                "background_fill_color": PAPER, "background_fill_alpha": 0.8, "level": "annotation",
+                "text": column, "text_font_size": "12px", "text_color": ink, "x_offset": x, "y_offset": y, "text_align": align,
+                "background_fill_color": paper, "background_fill_alpha": 0.8, "level": "annotation",
                 "view": CDSView(filter=BooleanFilter(None if y < 0 else [])),
             })
-            for source, column in ((self._anchors, "label"), (self._tags, "name"))
+            for source, column, ink, paper in (
+                (self._anchors, "label", "ink", "paper"), (self._tags, "name", NIGHT, PAPER),
+            )
             for x, y, align in _SIDES
         ]  # fmt: skip
+        # The legend has all states, whatever the anchors have: it needs data, which are nowhere.
+        nowhere, anchors = ColumnDataSource({"x": [math.nan], "y": [math.nan]}), []
+        for state, (marker, colour) in health.LOOKS.items():
+            outline = GREY if state == health.SILENT else NIGHT
+            style = {"marker": marker, "size": 15, "line_color": outline, "fill_color": colour}
+            view = CDSView(filter=GroupFilter(column_name="health", group=state))
+            anchors.append(("scatter", self._anchors, style | {"view": view}))
+            anchors.append(("scatter", nowhere, style | {"legend_label": state}))
         return [
             ("multi_polygons", self._accuracy, {
                 "fill_color": "colour", "fill_alpha": 0.6, "line_color": None, "legend_field": "step",
@@ -337,12 +351,7 @@ class Map:
                 "length": HEADING_M, "angle": "heading", "line_color": NIGHT, "line_width": 3, "legend_label": "heading",
             }),
             ("scatter", self._rays, marks | {"size": 7, "line_width": 2}),
-            ("scatter", self._anchors, {
-                "marker": marker, "size": 15, "line_color": outline, "fill_color": colour, "legend_label": "anchor",
-            }),
-            ("scatter", self._anchors, {
-                "size": "ring", "fill_color": None, "line_color": GREY, "line_width": 1.5, "legend_label": "selected anchor",
-            }),
+            *anchors,
             ("segment", self._anchors, {
                 "x0": "x", "y0": "y", "x1": "fit_x", "y1": "fit_y", "line_color": VERMILLION, "line_dash": "dotted", "line_width": 2,
             }),
@@ -363,19 +372,19 @@ class Map:
         self._draw_tracks(scene)
         self._draw_rays(scene)
         self._draw_accuracy(scene)
-        is_complete = self._page.view.complete is not None
+        is_complete = self._page.view.timeline.is_complete
         fitted = is_complete, bool(scene.anchors), bool(scene.anchors or scene.tracks)
         if fitted > self._fitted or not self._extent.data["x"]:
             self._fitted = fitted
             self.fit(scene)
         # The legend shows only what the map contains.
-        for item in self.plot.legend[0].items:
+        for item in self._items:
             data = item.renderers[0].data_source.data
             column = _OPTIONAL.get(getattr(item.label, "value", ""))
             item.visible = bool(np.isfinite(data[column]).any() if column else len(next(iter(data.values()))))
 
     def _draw_anchors(self, scene: Scene) -> None:
-        page, timeline, rows = self._page, self._page.view.timeline, []
+        page, displaced, rows = self._page, self._page.view.timeline.displaced, []
         selected = page.selected and page.selected[0]
         # The selected one first: its name has priority.
         for identity in sorted(scene.anchors, key=lambda identity: identity != selected):
@@ -386,16 +395,16 @@ class Map:
                 f" {state[0]}" if state not in (health.UNKNOWN, health.SILENT) else ""
             )
             fit = math.nan, math.nan
-            if timeline is not None and identity in timeline.displaced:
+            if identity in displaced:
                 label += " not here"
-                fit = timeline.displaced[identity][1].position[:2]
+                fit = displaced[identity][1].position[:2]
             elif state in (health.BAD, health.CHECK) and abs(residual_m) >= health.LONG_M:
                 # Rounded, so that the map is not drawn again for every range.
                 label += f" {residual_m:+.1f} m"
-            ring = RING if identity == selected else math.nan
-            rows.append((*anchor.position[:2], name, str(identity), state, label, ring, *fit))
-        if page.changed("anchors", rows):
-            set_rows(self._anchors, rows)
+            # The label of the selected one is white on black.
+            colours = (PAPER, NIGHT) if identity == selected else (NIGHT, PAPER)
+            rows.append((*anchor.position[:2], name, str(identity), state, label, *colours, *fit))
+        set_rows(self._anchors, rows)
 
     def _draw_tags(self, scene: Scene) -> None:
         rows = []
@@ -404,9 +413,9 @@ class Map:
             age_s, name, colour = scene.age_s(pose), tag_label(tag, plain_id), colours[tag]
             if age_s > NO_DATA_S:
                 name, colour = f"{name}: no data for {age_s:.0f} s", GREY
-            major, minor, angle = map(drawable, pose.ellipse)
-            ellipse = 2 * major, 2 * minor, angle
-            rows.append((pose.x, pose.y, name, colour, *ellipse, pose.heading_rad))
+            # A huge one would make all others invisible.
+            major, minor, angle = pose.ellipse if pose.ellipse[0] < MAX_RANGE_M else (math.nan,) * 3
+            rows.append((pose.x, pose.y, name, colour, 2 * major, 2 * minor, angle, pose.heading_rad))
         set_rows(self._tags, rows)
 
     def _draw_tracks(self, scene: Scene) -> None:
@@ -428,7 +437,7 @@ class Map:
                 if kind is TrackKind.CORRECTED:
                     colour, label = colours.get(name, BLUE), scene.track_name
                 rows.append((*self._trail(track.rows, scene.age_s(track)).T, colour, *style, label))
-            set_rows(self._tracks, rows)
+            self._tracks.data = columns_of(self._tracks, rows)
 
     def _trail(self, track: NDArray[np.float64], age_s: float) -> NDArray[np.float32]:
         """Return x and y of the displayed time of a track whose last point has an age, float32 (k, 2)."""
@@ -463,7 +472,7 @@ class Map:
             for xs, ys, limit_m in zip(areas.xs, areas.ys, areas.upper_levels, strict=True):
                 colour = cividis(len(health.STEPS_M))[health.STEPS_M.index(limit_m)]
                 rows.append((xs, ys, colour, f"sd \u2264 {limit_m:g} m"))
-        set_rows(self._accuracy, rows)
+        self._accuracy.data = columns_of(self._accuracy, rows)
 
     def fit(self, scene: Scene) -> None:
         """Fit the view of the map to its current content."""
@@ -471,8 +480,7 @@ class Map:
         places += [(pose.x, pose.y) for pose in scene.tags.values()]
         for track in list(self._page.view.all_data.tracks.values()):
             places += np.percentile(track.rows[:, 1:3], (2, 98), axis=0).tolist() if len(track.rows) else []
-        if timeline := self._page.view.timeline:
-            places += [anchor.position[:2] for _, anchor in timeline.displaced.values()]
+        places += [anchor.position[:2] for _, anchor in self._page.view.timeline.displaced.values()]
         corners = np.array(places or [(0.0, 0.0), (10.0, 10.0)])
         low, high = corners.min(axis=0), corners.max(axis=0)
         # A margin for ellipses and labels; without anchors, one in which the tag can move.
@@ -520,18 +528,14 @@ def stroke(kind: TrackKind) -> dict[str, Any]:
     return {"line_color": colour, "line_width": width, "line_dash": dash, "legend_label": kind.value}
 
 
-def marks_of(column: str, looks: Mapping[str, tuple[str, str | None]]) -> tuple[Any, Any]:
-    """Return markers and colours for the values of a column; `looks`: {value: marker and colour}."""
-    names, (markers, colours) = list(looks), zip(*looks.values(), strict=True)
-    inks = [colour or NIGHT for colour in colours]
-    return factor_mark(column, markers, names), factor_cmap(column, inks, names, nan_color=GREY)
-
-
 def status_marks() -> dict[str, Any]:
     """Return marker and colour of marks whose column `status` has the name of a status."""
-    looks = {status.name: (look.marker, look.colour) for status, look in palette.STATUS_LOOKS.items()}
-    marker, colour = marks_of("status", looks)
-    return {"marker": marker, "color": colour, "legend_field": "status"}
+    names = [status.name for status in palette.STATUS_LOOKS]
+    markers, colours = zip(
+        *((look.marker, look.colour or NIGHT) for look in palette.STATUS_LOOKS.values()), strict=True
+    )
+    colour = factor_cmap("status", colours, names, nan_color=GREY)
+    return {"marker": factor_mark("status", markers, names), "color": colour, "legend_field": "status"}
 
 
 def thinned(table: NDArray[np.float64], gap_s: float) -> NDArray[np.float64]:

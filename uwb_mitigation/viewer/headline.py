@@ -19,6 +19,8 @@ from uwb_mitigation.viewer.state import View
 
 WHOLE, RECENT, LIVE = "whole recording", f"last {HISTORY_S:.0f} s", "since the start"
 """Names of the intervals."""
+NAMES = {TrackKind.RAW: "raw + same filter", TrackKind.SMOOTHED: TrackKind.SMOOTHED.value}
+"""Names of the tracks that are compared with the corrected one."""
 
 Card = list[str]
 """Title, value and explanation of a figure."""
@@ -28,11 +30,10 @@ def cards(view: View, tag_id: int | None) -> list[Card]:
     """Return the figures of a tag (None: without ranges) and of all ranges."""
     positions, scene = Positions(view, tag_id), view.scene
     if view.player is None:
-        return positions.cards(scene.clock() - HISTORY_S, RECENT, "raw + locator") + _range_cards(scene, LIVE)
-    if view.timeline is None:
+        return positions.cards(scene.clock() - HISTORY_S, RECENT) + _range_cards(scene, LIVE)
+    if not view.timeline.is_read:
         return [["Reading the recording ...", "", ""]]
-    raw_name = "raw + same filter" if view.timeline.estimates else "raw + locator with default settings"
-    return positions.cards(-math.inf, WHOLE, raw_name) + _range_cards(scene, WHOLE)
+    return positions.cards(-math.inf, WHOLE) + _range_cards(scene, WHOLE)
 
 
 def _range_cards(scene: Scene, window: str) -> list[Card]:
@@ -61,15 +62,15 @@ class Positions:
     """
 
     def __init__(self, view: View, tag_id: int | None) -> None:
-        is_ready = view.player is None or view.complete is not None
-        self._tracks = {key: track.rows for key, track in view.all_data.tracks.items()} if is_ready else {}
+        is_ready, all_data = view.timeline.is_complete, view.all_data
+        self._tracks = {key: track.rows for key, track in all_data.tracks.items()} if is_ready else {}
         self._names = [name for name, kind in self._tracks if kind is TrackKind.CORRECTED]
         self._is_corrected = view.scene.corrected > 0
         self._name = next(iter(self._names), "")
         if tag_id is not None:
             self._name = tag_name(tag_id, self._names, view.all_data.pairs)
         self._frame = tag_label(self._name or DEFAULT_TAG, tag_id).replace(" ", "_")
-        self._estimated = view.complete.estimates.get(self._name) if view.complete else None
+        self._estimated = view.timeline.estimates.get(self._name) if is_ready else None
 
     def track(self, kind: TrackKind) -> NDArray[np.float64] | None:
         """Return the track of a kind; a true track has the frame of the tag as name, or any name if there is only one tag."""
@@ -110,36 +111,25 @@ class Positions:
             error_m = np.linalg.norm((track.position - truth.position_at(track.stamp_ns))[:, :2], axis=1)
         return np.column_stack([columns[:, 0], error_m, 2.0 * columns[:, 4]])
 
-    def cards(self, begin_s: float, window: str, raw_name: str) -> list[Card]:
-        """Return the figures of the positions from a time on.
-
-        Args:
-            begin_s: this time.
-            window: name of the interval.
-            raw_name: name of the track of raw ranges.
-        """
+    def cards(self, begin_s: float, window: str) -> list[Card]:
+        """Return the figures of the positions from a time on; `window`: name of this interval."""
         track = self.track(TrackKind.CORRECTED)
         if track is None:
             return []
         if self.track(TrackKind.TRUE) is None:
             median_m = _metres(track[track[:, 0] > begin_s, 4], np.median)
             return [[f"Reported standard deviation, {window}", median_m, "median; no true positions"]]
-        names = {TrackKind.RAW: raw_name, TrackKind.SMOOTHED: TrackKind.SMOOTHED.value}
-        errors = {
-            name: self.errors(kind, begin_s) for kind, name in names.items() if self.track(kind) is not None
-        }
+        errors = {kind: self.errors(kind, begin_s) for kind in NAMES if self.track(kind) is not None}
         corrected, shown = self.errors(TrackKind.CORRECTED, begin_s), []
         for title, name in (("Position RMSE", "rmse"), ("95 % of position errors below", "p95")):
-            filter_texts = (
-                f"{filter_name}: {_metres(getattr(error, name))}" for filter_name, error in errors.items()
-            )
-            shown.append([f"{title}, {window}", _metres(getattr(corrected, name)), "; ".join(filter_texts)])
-        raw_m = errors[raw_name].rmse if raw_name in errors else math.nan
+            others = (f"{NAMES[kind]}: {_metres(getattr(error, name))}" for kind, error in errors.items())
+            shown.append([f"{title}, {window}", _metres(getattr(corrected, name)), "; ".join(others)])
+        raw_m = errors.get(TrackKind.RAW, NO_ERRORS).rmse
         # Without corrections, offsets make the difference.
         if self._is_corrected and corrected.rmse + raw_m > 0.0:
             percent = 100.0 * (corrected.rmse / raw_m - 1.0)
             change = f"{abs(percent):.0f} % {'more' if percent > 0.0 else 'less'} error"
-            text = f"position RMSE {corrected.rmse:.3f} m; {raw_name}: {raw_m:.3f} m"
+            text = f"position RMSE {corrected.rmse:.3f} m; {NAMES[TrackKind.RAW]}: {raw_m:.3f} m"
             shown.append([f"Correction, {window}", change if abs(percent) >= 0.5 else "no change", text])
         return shown
 

@@ -50,6 +50,9 @@ MAX_SD_M = 0.5
 MIN_ANCHORS = 3
 MAX_HEADLINE = 60
 """Maximum number of characters of a reason with its explanation."""
+JUMP_S = 60.0
+"""Time for which a jump of a clock is the reason for a missing position; of a lost one, until it is back."""
+SYNCHRONISE = "Synchronise the clocks of the computers (such as with chrony), then restart the locator."
 HOLD_S = 2.0
 """Time for which a better verdict must hold before it is shown."""
 RADIUS95 = math.sqrt(5.991 / 2.0)
@@ -58,6 +61,8 @@ CELLS = 40
 """Width and height of the map of the predicted accuracy, points."""
 STEPS_M = (0.1, 0.2, 0.5, 1.0, 10.0)
 """Upper limits of the colours of the map of the predicted accuracy; above the last one, it is not shown."""
+
+_NO_JUMP = -math.inf, 0.0
 
 Means = Mapping[str, float]
 """Means of a pair or an anchor: `rate` (Hz); `nlos`, `lost`, `not_ok` (%); `residual`, corrected range minus distance to
@@ -192,6 +197,13 @@ def verdict(
     if ages_s and min(ages_s) > NO_DATA_S:
         reason = f"no ranges of {name} for {min(ages_s):.0f} s"
         return Verdict(LOST, reason, "Check power of the tag, and the driver.")
+    jump_at_s, jump_s = scene.incidents.clock_jumps.get(-1 if tag_id is None else tag_id, _NO_JUMP)
+    # The last positions before a jump may arrive after it.
+    is_lost = pose is not None and scene.age_s(pose) > NO_DATA_S
+    begin_s = scene.clock() - JUMP_S if pose is None else pose.received_s - NO_DATA_S
+    if (pose is None or is_lost) and jump_at_s > begin_s:
+        reason = f"the clock of {name} jumped by {jump_s:+.0f} s"
+        return Verdict(LOST if is_lost else UNDETERMINED, reason, SYNCHRONISE)
     if pose is None:
         action = action or "see the notices below"
         silent = sorted(set(scene.anchors).difference(received))
@@ -201,7 +213,7 @@ def verdict(
             reason = f"only {senders} ranges; no ranges from {missing}" + (", ..." if silent[6:] else "")
             action = f"Find out why: check power, PAN id, and ids in the anchors file. Without them: {action}"
         return Verdict(UNDETERMINED, reason or f"no position of {name}", _sentence(action))
-    if scene.age_s(pose) > NO_DATA_S:
+    if is_lost:
         reason = f"no position of {name} for {scene.age_s(pose):.0f} s"
         return Verdict(LOST, reason, _sentence(remedy or "Drive into the area of the anchors"))
     sd_m = pose.sd_m

@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections import OrderedDict
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -45,6 +44,10 @@ class BoundedDict(OrderedDict[K, V]):
         super().__init__()
         self._limit = limit
 
+    def touch(self, key: K, new: Callable[[], V]) -> V:
+        """Return the value of a key, or a new one, as the latest entry."""
+        return self.add(key, self[key] if key in self else new())
+
     def add(self, key: K, value: V) -> V:
         self[key] = value
         self.move_to_end(key)
@@ -69,9 +72,15 @@ class Rows:
         return self._data[self._begin : self._end]
 
     @property
+    def last(self) -> list[Any]:
+        """The values of the last row; NaN: there is none."""
+        has_rows = self._end > self._begin
+        return list(self._data[self._end - 1].tolist()) if has_rows else [math.nan] * self._data.shape[1]
+
+    @property
     def received_s(self) -> float:
         """Time of reception of the last row; NaN: there is none."""
-        return float(self._data[self._end - 1, 0]) if self._end > self._begin else math.nan
+        return float(self.last[0])
 
     def append(self, row: Sequence[float], limit: int | None = None) -> None:
         """Append a row, and remove the first ones above a limit."""
@@ -136,39 +145,17 @@ class Sample(NamedTuple):
     sequence: int = 0
 
 
-@dataclass(frozen=True, eq=False)
-class Trace:
-    """One CIR; its magnitudes are computed only if it is shown."""
-
-    cir: Cir
-
-    @classmethod
-    def from_cir(cls, cir: Cir) -> Trace | None:
-        """Return the trace of a CIR; None if it is empty, too long or implausible."""
-        odd = cir.encoding is Encoding.COMPLEX_INT16 and len(cir.samples) % 2
-        if odd or not 0 < len(cir.samples) <= MAX_VALUES:
-            return None
-        # The largest sample times the scale must fit a float32, and the index of the first path an int32.
-        is_far = math.isfinite(cir.first_path_index) and abs(cir.first_path_index) >= 2**31
-        if is_far or not abs(cir.scale) < 1e30:
-            return None
-        # Copy the samples: they may be a view into a large message.
-        return cls(replace(cir, samples=cir.samples.copy()))
-
-    @cached_property
-    def magnitude(self) -> NDArray[np.float32]:
-        """Magnitudes in accumulator units, float32 (n,)."""
-        values = self.cir.samples.astype(np.float32)
-        if self.cir.encoding is Encoding.COMPLEX_INT16:
-            values = np.hypot(values[0::2], values[1::2])
-        magnitude: NDArray[np.float32] = values * np.float32(self.cir.scale)
-        return magnitude
-
-    @property
-    def origin(self) -> int:
-        """Accumulator index of the first path; the first sample if it is unknown."""
-        first = self.cir.first_path_index
-        return math.floor(first) if math.isfinite(first) else self.cir.start_index
+def plausible_cir(cir: Cir) -> Cir | None:
+    """Return a CIR that can be drawn; None if it is empty, too long or implausible."""
+    odd = cir.encoding is Encoding.COMPLEX_INT16 and len(cir.samples) % 2
+    if odd or not 0 < len(cir.samples) <= MAX_VALUES:
+        return None
+    # The largest sample times the scale must fit a float32, and the index of the first path an int32.
+    is_far = math.isfinite(cir.first_path_index) and abs(cir.first_path_index) >= 2**31
+    if is_far or not abs(cir.scale) < 1e30:
+        return None
+    # Copy the samples: they may be a view into a large message.
+    return replace(cir, samples=cir.samples.copy())
 
 
 class History(Rows):
@@ -179,13 +166,13 @@ class History(Rows):
         outages: see `new_outages`; None: none.
 
     Attributes:
-        trace: the last CIR of a stream.
+        cir: the last CIR of a stream.
     """
 
     def __init__(self, rows: NDArray[np.float64] | None = None, outages: Rows | None = None) -> None:
         super().__init__(np.empty((0, len(RangeColumns._fields))) if rows is None else rows)
         self._outages = new_outages() if outages is None else outages
-        self.trace: Trace | None = None
+        self.cir: Cir | None = None
 
     @property
     def is_interrupted(self) -> bool:
@@ -208,13 +195,13 @@ class History(Rows):
         """The last range."""
         if self._end == self._begin:
             return None
-        sample = Sample(*self._data[self._end - 1, -len(Sample._fields) :].tolist())
+        sample = Sample(*self.last[STAMP:])
         return sample._replace(status=Status(int(sample.status)))
 
     @property
     def latest_stamp_s(self) -> float:
         """Stamp of the last range; NaN: there is none."""
-        return float(self._data[self._end - 1, STAMP]) if self._end > self._begin else math.nan
+        return float(self.last[STAMP])
 
     def add(self, sample: Sample, received_s: float, residual_m: float, limit: int | None) -> None:
         """Add a range; see `RangeColumns` and `append`."""

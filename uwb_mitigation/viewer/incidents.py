@@ -6,6 +6,9 @@ import math
 from bisect import insort
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.viewer.histories import NO_DATA_INTERVALS, NO_DATA_S, BoundedDict, Pair
 
@@ -38,11 +41,13 @@ class Incidents:
         count: number of incidents.
         latest: time (s) and text of the latest `MAX_EVENTS`, in the order of time.
         largest_error: time (s) and text of the largest error of a recording, which is always shown.
+        clock_jumps: {tag: time and size of the latest jump of the clock of its stamps, s}.
     """
 
     def __init__(self) -> None:
         self.count, self.latest = 0, list[tuple[float, str]]()
         self.largest_error: list[tuple[float, str]] = []
+        self.clock_jumps: BoundedDict[int, tuple[float, float]] = BoundedDict(MAX_SOURCES)
         # A tag comes before its anchors.
         self._sources: BoundedDict[tuple[int | None, int | str], _Source] = BoundedDict(MAX_SOURCES)
         self._check_s = -math.inf
@@ -63,6 +68,7 @@ class Incidents:
         jump_s, source.stamp_s = stamp_s - source.stamp_s - passed_s, stamp_s
         # Ranges that are read late arrive at once.
         if abs(jump_s) > CLOCK_JUMP_S:
+            self.clock_jumps.add(pair[1], (time_s, jump_s))
             self.add(time_s, f"clock of tag {format_id(pair[1])}: jump by {jump_s:+.0f} s")
         self._add(pair, time_s)
 
@@ -72,6 +78,13 @@ class Incidents:
         moved_m, source.place = math.dist(source.place, (x, y)), (x, y)
         if moved_m > JUMP_M + MAX_SPEED * passed_s:
             self.add(time_s, f"position of {label}: jump by {moved_m:.1f} m")
+
+    def add_track(self, label: str, rows: NDArray[np.float64], end_s: float) -> None:
+        """Add all positions of a tag until the end of a recording: time, x and y, float64 (n, 3)."""
+        self._check_s = -math.inf
+        for time_s, x, y in rows.tolist():
+            self.add_position(label, time_s, x, y)
+        self.check(end_s)
 
     def _add(self, key: tuple[int | None, int | str], time_s: float) -> tuple[_Source, float]:
         """Return a source and the time since its last data."""

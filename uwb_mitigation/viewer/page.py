@@ -13,6 +13,7 @@ from bokeh.document import Document
 from bokeh.events import Reset
 
 from uwb_mitigation.errors import format_id
+from uwb_mitigation.types.measurement import FAULTS
 from uwb_mitigation.viewer import health
 from uwb_mitigation.viewer.figures import HEADINGS, Figures
 from uwb_mitigation.viewer.histories import Pair
@@ -100,7 +101,7 @@ class Page:
         """Update every model from the scene, and number the update if anything has changed."""
         self._draw_player()
         player, scene = self._player, self._view.scene
-        position = player and (player.shown_s, player.is_behind, self._view.timeline is None)
+        position = player and (player.shown_s, player.is_behind, self._view.timeline.is_read)
         with self._view.scene.lock:
             # Ages change without data; drawing them once a second is enough.
             state = scene.revision, self._state.selected, math.floor(scene.clock()), position
@@ -111,10 +112,7 @@ class Page:
         if is_changed or now_s > self._sent_s + HEARTBEAT_S:
             self._sent, self._sent_s, self._redraw = self._sent + 1, now_s, False
             age_s = scene.clock() - scene.received_s if self._state.has_data else -1.0
-            stamp_s = scene.latest_stamp_s(self._state.tag_id)
-            stamp_age_s = scene.stamp_clock() - stamp_s if math.isfinite(stamp_s) else age_s
-            numbers = round(self._took_s, 3), round(age_s, 3), round(stamp_age_s, 3)
-            self._controls.update = [self._sent, *numbers]
+            self._controls.update = [self._sent, round(self._took_s, 3), round(age_s, 3)]
 
     def _draw_scene(self, scene: Scene) -> None:
         state = self._state
@@ -144,9 +142,11 @@ class Page:
         self._state.set(player=shown | {"position": position_s, "seconds": player.seconds})
         self._figures.position.location = position_s
         timeline, seconds = self._view.timeline, max(player.seconds, 1e-9)
-        if timeline is not None and self._state.changed("marks", timeline.is_complete):
-            bad = np.unique((timeline.bad_s / seconds).round(3)).tolist()
+        if timeline.is_read and self._state.changed("marks", timeline.is_complete):
             recorded = timeline.scene.incidents
+            ranges = [history.columns for history in timeline.scene.pairs.values()]
+            bad_s = [columns.received_s[np.isin(columns.status, FAULTS)] for columns in ranges]
+            bad = np.unique((np.concatenate([np.zeros(0), *bad_s]) / seconds).round(3)).tolist()
             shares = [time_s / seconds for time_s, _ in recorded.all()]
             counts = {"faults": timeline.scene.faults, "events": recorded.count + len(recorded.largest_error)}
             self._state.set(marks={"bad": bad, "incidents": shares} | counts)

@@ -20,19 +20,12 @@ from uwb_mitigation.mitigation.model.choice import Choice
 from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.recorded_tracks import TagTracks
 from uwb_mitigation.recordings.bag.anchor_markers import parse_markers
+from uwb_mitigation.types.measurement import Cir
 from uwb_mitigation.types.ros.topics import ANCHORS
 from uwb_mitigation.types.stamps import NS_PER_S
-from uwb_mitigation.viewer.histories import Pair, Trace
-from uwb_mitigation.viewer.recording import (
-    POSITIONS,
-    RANGES,
-    Displaced,
-    Recording,
-    Timeline,
-    estimate_tracks,
-    read_recording,
-)
-from uwb_mitigation.viewer.scene import MissingData, Scene
+from uwb_mitigation.viewer.histories import Pair
+from uwb_mitigation.viewer.recording import POSITIONS, RANGES, Recording
+from uwb_mitigation.viewer.scene import Displaced, Scene
 
 MAX_STEP_S = 1.0
 """If no page was open for longer than this, playing continues from the last position."""
@@ -58,9 +51,8 @@ class BagPlayer:
         playing: whether `advance` changes the position.
         speed: recorded seconds per second.
         corrects: whether the bag contains raw ranges only.
-        timeline: content of the recording as far as it has been read.
+        timeline: the recording as far as it has been read.
         scene: what is shown; `index` sets its anchors.
-        missing: messages for the page on data that the bag does not contain.
         models: number of ranges that `index` corrected, by choice of the model.
         error: what has stopped the thread of `index`; the page shows it.
     """
@@ -70,20 +62,21 @@ class BagPlayer:
 
     def __init__(self, path: Path, backend: Callable[[], Corrector], namespace: str | None = None) -> None:
         self.scene, self._new_backend = Scene(), backend
-        self._recording = recording = Recording(path, namespace)
+        self.timeline = recording = Recording(path, namespace)
         self.seconds, self.corrects = recording.seconds, recording.corrects
         self.position_s, self.speed, self.playing = 0.0, 1.0, False
-        self.timeline = Timeline()
         self.models: Mapping[Choice, int] = {}
         self.error: Exception | None = None
-        self.missing = MissingData("No ranges up to this time.", "No anchor positions: set --anchors FILE.")
-        if not recording.contents & RANGES:
-            self.missing.ranges = "The recording contains tracks without ranges."
-        if not recording.contents & POSITIONS:
-            needs = "they need anchors, and --height if all anchors have one height"
-            self.missing.positions = f"No tag positions: {needs}."
+        needs = "they need anchors, and --height if all anchors have one height"
+        self.scene.missing = {
+            "ranges": "No ranges up to this time."
+            if recording.contents & RANGES
+            else "The recording contains tracks without ranges.",
+            "anchors": "No anchor positions: set --anchors FILE.",
+            "positions": "" if recording.contents & POSITIONS else f"No tag positions: {needs}.",
+        }
         self._advanced_s, self._drawn_s = time.monotonic(), math.nan
-        self._read_trace = lru_cache(16)(recording.read_trace)
+        self._read_cir = lru_cache(16)(recording.read_cir)
         self.scene.clock = lambda: self.shown_s
         self.scene.stamp_clock = lambda: self.shown_s + recording.start_ns / NS_PER_S
         # Anchors are published once at the beginning.
@@ -110,35 +103,34 @@ class BagPlayer:
         """Read the recording in a thread, which is returned.
 
         Args:
-            config: of the estimators, see `estimate_tracks`; its anchors are shown.
-            stamp_offset_s: added to the stamps of the ranges.
+            config: its anchors are shown; see `Recording.estimate`, also for the other arguments.
+            stamp_offset_s: see there.
             check: returns `Timeline.displaced` for estimated tracks.
-            estimated: tracks that are known already.
+            estimated: see there.
 
         Raises:
             UwbMitigationError: the backend cannot be opened.
         """
-        timeline, recording = self.timeline, self._recording
+        timeline = self.timeline
         backend = self._new_backend() if self.corrects else None
-
-        def read() -> None:
-            table = read_recording(recording, backend, timeline)
-            self.models = {} if backend is None else backend.used
-            if config is not None:
-                estimate_tracks(recording, timeline, table, config, stamp_offset_s, estimated)
-            timeline.is_complete = True
-            self._show()
-            if check is not None and config is not None and timeline.estimates:
-                if timeline.scene.ranges <= MAX_CHECKED:
-                    timeline.displaced = check(list(timeline.estimates.values()), config)
-                else:
-                    limit = f"up to {MAX_CHECKED} ranges: run `track`."
-                    timeline.notices.append(f"The positions of anchors are checked in recordings of {limit}")
-            self._show()
 
         def run() -> None:
             try:
-                read()
+                timeline.read(backend)
+                self.models = {} if backend is None else backend.used
+                if config is not None:
+                    timeline.estimate(config, stamp_offset_s, estimated)
+                timeline.is_complete = True
+                self._show()
+                if check is not None and config is not None and timeline.estimates:
+                    if timeline.scene.ranges <= MAX_CHECKED:
+                        timeline.displaced = check(list(timeline.estimates.values()), config)
+                    else:
+                        limit = f"up to {MAX_CHECKED} ranges: run `track`."
+                        timeline.notices.append(
+                            f"The positions of anchors are checked in recordings of {limit}"
+                        )
+                self._show()
             except Exception as error:  # A player without a reader would wait for ever.
                 self.error = error
                 timeline.notices.append(f"Reading stopped: {type(error).__name__}: {error}")
@@ -183,11 +175,11 @@ class BagPlayer:
         if self.shown_s != self._drawn_s:
             self._show()
 
-    def read_trace(self, pair: Pair) -> Trace | None:
+    def read_cir(self, pair: Pair) -> Cir | None:
         """Return the last CIR of a pair up to the position; None: it has none."""
         times_ns = self.timeline.cirs_ns.get(pair, [])
         count = bisect_right(times_ns, (self.shown_s + 1e-6) * NS_PER_S)
-        return self._read_trace(pair, times_ns[count - 1]) if count else None
+        return self._read_cir(pair, times_ns[count - 1]) if count else None
 
     def _show(self) -> None:
         self._drawn_s = self.shown_s

@@ -1,6 +1,6 @@
-"""A recording: its topics in one namespace, and its index with all ranges and the complete tracks of the tags.
+"""A recording: its topics in one namespace, all of its ranges, and the complete tracks of the tags.
 
-The times of the player, its marks and the figures are log times: the times at which a subscriber received the messages.
+Times are log times: the times at which a subscriber received the messages.
 """
 
 from __future__ import annotations
@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,22 +24,22 @@ from uwb_mitigation.positioning.recorded_tracks import TagTracks, check_one_tag,
 from uwb_mitigation.recordings.bag.pose_paths import read_truth
 from uwb_mitigation.recordings.bag.reader import BagReader, check_channel
 from uwb_mitigation.recordings.recorded_ranges import KEY, RangeTable, Table, match
-from uwb_mitigation.types.anchors import Anchor, AnchorMap
-from uwb_mitigation.types.measurement import FAULTS
+from uwb_mitigation.types.anchors import AnchorMap
+from uwb_mitigation.types.measurement import Cir
 from uwb_mitigation.types.ros import schemas, topics
 from uwb_mitigation.types.ros.codec import measurement_key
 from uwb_mitigation.types.ros.poses import tag_frame
 from uwb_mitigation.types.stamps import NS_PER_S
-from uwb_mitigation.types.tracks import Track, TruePath
+from uwb_mitigation.types.tracks import TruePath
 from uwb_mitigation.viewer.feed import DECODERS, SceneUpdater
-from uwb_mitigation.viewer.histories import MAX_RANGE_M, NO_DATA_S, Pair, Trace
-from uwb_mitigation.viewer.incidents import Incidents
+from uwb_mitigation.viewer.histories import MAX_RANGE_M, NO_DATA_S, Pair, RangeColumns, plausible_cir
 from uwb_mitigation.viewer.palette import ATTRIBUTES, TrackKind
 from uwb_mitigation.viewer.scene import (
     DEFAULT_TAG,
     MAX_TAGS,
     POSITION,
     Scene,
+    Timeline,
     antenna_position,
     tag_label,
     tag_name,
@@ -50,9 +49,6 @@ BATCH = 64
 """Number of messages that are read ahead to correct their ranges in one call."""
 POSITIONS = frozenset({topics.POSE, topics.ODOMETRY, topics.POSE_SMOOTHED})
 RANGES = frozenset({topics.RANGE_RAW, topics.RANGE_CORRECTED})
-
-Displaced = dict[int, tuple[float, Anchor]]
-"""{anchor whose ranges fit another position: (its median held-out residual, m, the anchor there)}."""
 
 _TRUTH = np.dtype([*KEY, ("true_m", "f8")])
 _POSITION_TOPIC = re.compile(r"(.*)/uwb/(?:(tag_(?:\d+|0x[0-9a-f]+))/)?(pose|odometry|pose_smoothed)")
@@ -73,8 +69,8 @@ class Event(NamedTuple):
     tag: str
 
 
-class Recording:
-    """A bag with ranges or tracks.
+class Recording(Timeline):
+    """A bag with ranges or tracks, and what was read from it; times are log times from the beginning.
 
     Args:
         path: an MCAP file or a rosbag2 folder.
@@ -85,6 +81,7 @@ class Recording:
         prefix: the namespace.
         contents: topics without namespace and tag.
         damage: of the messages that were read; empty: none.
+        read_s: time up to which it has been read.
 
     Raises:
         RecordingError: the path is not an MCAP bag, or contains neither ranges nor tracks, or ranges of another version.
@@ -92,7 +89,8 @@ class Recording:
     """
 
     def __init__(self, path: Path, namespace: str | None = None) -> None:
-        self.path, self._bag = path, BagReader(path)
+        super().__init__(Scene(lambda: self.read_s, is_whole=True))
+        self.path, self._bag, self._table = path, BagReader(path), RangeTable()
         types, bounds = self._bag.topics, self._bag.bounds_ns
         self.prefix = prefix = _namespace(path, types) if namespace is None else namespace.rstrip("/")
         for channel in self._bag.channels:
@@ -114,7 +112,7 @@ class Recording:
         if bounds is None or not self.contents & (RANGES | POSITIONS):
             raise _no_ranges(path, types)
         self.start_ns, self.seconds = bounds[0], (bounds[1] - bounds[0]) / 1e9
-        self.damage = ""
+        self.damage, self.read_s = "", 0.0
 
     @property
     def contents(self) -> set[str]:
@@ -148,12 +146,107 @@ class Recording:
                     corrected = measurement_key(event.message), next(results)
                     yield event._replace(topic=topics.RANGE_CORRECTED, message=corrected)
 
-    def read_trace(self, pair: Pair, log_ns: int) -> Trace | None:
+    def read_cir(self, pair: Pair, log_ns: int) -> Cir | None:
         """Return the CIR of the first range of a pair from a time on; None: it has none that can be shown."""
         for event in self.events([topics.RANGE_RAW], log_ns):
             if (event.message.anchor_id, event.message.tag_id) == pair:
-                return Trace.from_cir(event.message.cir)
+                return plausible_cir(event.message.cir)
         return None
+
+    def read(self, backend: Corrector | None) -> None:
+        """Read all messages; what has been read may be shown meanwhile.
+
+        Args:
+            backend: corrects raw ranges; None: the recording contains corrected ranges.
+        """
+        scene, truths, feed = self.scene, Table(_TRUTH), SceneUpdater(self.scene)
+        for log_ns, topic, message, tag in self.corrected_events(backend):
+            self.read_s = log_ns / NS_PER_S
+            if topic == topics.RANGE_RAW:
+                self._table.add_raw(message)
+                if len(message.cir.samples):
+                    self.cirs_ns.setdefault((message.anchor_id, message.tag_id), []).append(log_ns)
+            elif topic == topics.RANGE_TRUTH:
+                truths.add(*message[0], message[1].range_m)
+            elif topic == topics.RANGE_CORRECTED:
+                self._table.add_corrected(*message)
+            if topic not in (topics.ANCHORS, topics.RANGE_RAW, topics.RANGE_TRUTH):
+                feed.add(topic, message, tag)
+        with scene.lock:
+            if self.damage:
+                self.notices.append(f"{self.damage}: nothing beyond can be shown")
+            self._add_truths_and_levels(truths.array())
+            self.read_s, self.is_read = self.seconds, True
+            scene.incidents.check(self.seconds)
+            _add_largest_error(scene)
+
+    def _add_truths_and_levels(self, truths: NDArray[Any]) -> None:
+        """Set true ranges (rows of `_TRUTH`) and levels, which may be in any order, and count the errors."""
+        ranges, measured = self._table.corrected.array(), self._table.raw.array()
+        true_m = np.append(truths["true_m"], np.nan)[match(ranges, truths)]
+        gap_db, rx_dbm = (
+            np.append(measured[name], np.nan)[match(ranges, measured)] for name in ("gap_db", "rx_dbm")
+        )
+        order, first = np.lexsort((ranges["tag"], ranges["anchor"])), 0
+        # By anchor and tag, as the ranges.
+        for _, history in sorted(self.scene.pairs.items()):
+            rows, columns = order[first : first + len(history.rows)], history.columns
+            first += len(rows)
+            columns.true_m[:], columns.gap_db[:], columns.rx_dbm[:] = true_m[rows], gap_db[rows], rx_dbm[rows]
+        self.scene.count_errors(np.stack([ranges["raw_m"], ranges["range_m"]]) - true_m)
+
+    def estimate(
+        self, config: EstimatorConfig, stamp_offset_s: float = 0.0, estimated: Sequence[TagTracks] = ()
+    ) -> None:
+        """Add residuals and estimated tracks (only those of raw ranges if there are positions) to what was read.
+
+        Args:
+            config: of the estimators.
+            stamp_offset_s: added to the stamps of the ranges.
+            estimated: tracks with `config` that are known already.
+        """
+        truths: dict[int | None, TruePath] = {}
+        with contextlib.suppress(RecordingError):
+            truths = read_truth(self.path, self.prefix + topics.ODOMETRY_TRUTH)
+        recorded, scene = self._table.by_tag(config.anchors, stamp_offset_s, truths), self.scene
+        by_tag = {one.recording.tag_id: one for one in estimated}
+        names = {name for name, kind in scene.tracks if kind is TrackKind.CORRECTED}
+        for tag in recorded.tags[:MAX_TAGS]:
+            of_tag = [history.rows for pair, history in scene.pairs.items() if pair[1] == tag.tag_id]
+            if not of_tag:
+                continue
+            name = tag_name(tag.tag_id, names, scene.pairs) or tag_frame(tag.tag_id)
+            if self.contents & POSITIONS:
+                tracks = {TrackKind.RAW: live_track(config, tag.raw)}
+            else:
+                try:
+                    check_one_tag(config, recorded.tags)
+                    estimate = by_tag.get(tag.tag_id) or track_tag(tag, config)
+                except (DatasetError, ParameterError) as error:
+                    self.notices.append(str(error))
+                    continue
+                self.estimates[name] = estimate
+                tracks = {kind: getattr(estimate, attribute) for kind, attribute in ATTRIBUTES.items()}
+                label, state = f"tag {format_id(tag.tag_id)}", str(estimate.determination)
+                self.notices += [
+                    f"{label}{' determination' * (text == state)}: {text}" for text in estimate.warnings
+                ]
+            ranges = RangeColumns(*np.concatenate(of_tag).T)
+            order = np.argsort(ranges.stamp_s, kind="stable")
+            for kind, track in tracks.items():
+                rows = np.full((len(track), POSITION), np.nan)
+                rows[:, 5] = track.stamp_ns / NS_PER_S - stamp_offset_s
+                rows[:, 0] = np.interp(rows[:, 5], ranges.stamp_s[order], ranges.received_s[order])
+                rows[:, 1:4] = track.position
+                rows[:, 4] = np.sqrt(track.covariance[:, 0, 0] + track.covariance[:, 1, 1])
+                if kind is TrackKind.CORRECTED:
+                    rows[:, 6:9] = [horizontal_ellipse(covariance) for covariance in track.covariance]
+                    scene.incidents.add_track(tag_label(name, None), rows[:, :3], self.seconds)
+                with scene.lock:
+                    scene.set_track(name, kind, rows)
+        # Tracks are those of the antenna, poses those of the robot.
+        is_of_robot = topics.POSE in self.contents
+        add_residuals(scene, config.anchors, scene.lever_arms if is_of_robot else {})
 
 
 def _decode(topic: str, data: bytes) -> Any:
@@ -182,168 +275,6 @@ def _no_ranges(path: Path, types: dict[str, str]) -> RecordingError:
     return RecordingError(
         "no ranges and no tracks", where=str(path), valid=f"the bag contains: {contents or 'no topic'}"
     )
-
-
-@dataclass
-class Timeline:
-    """Content of a recording: everything that does not depend on the position of the player.
-
-    Attributes:
-        scene: its ranges, positions and incidents; times are log times from the beginning.
-        read_s: time up to which it has been read. is_read: whether it has been read completely.
-        cirs_ns: {pair: log time of each raw range with a CIR}.
-        notices: messages for the page.
-        estimates: {tag: its estimated tracks}, if the recording contains no positions.
-        displaced: the anchor whose ranges fit another position.
-        is_complete: whether tracks, residuals and all incidents have been added.
-    """
-
-    scene: Scene = field(default_factory=lambda: Scene(is_whole=True))
-    read_s: float = 0.0
-    is_read: bool = False
-    cirs_ns: dict[Pair, list[int]] = field(default_factory=dict)
-    notices: list[str] = field(default_factory=list)
-    estimates: dict[str, TagTracks] = field(default_factory=dict)
-    displaced: Displaced = field(default_factory=dict)
-    is_complete: bool = False
-
-    def __post_init__(self) -> None:
-        self.scene.clock = lambda: self.read_s
-
-    @property
-    def bad_s(self) -> NDArray[np.float64]:
-        """Times of the ranges whose status needs attention."""
-        columns = (history.columns for history in self.scene.pairs.values())
-        times_s = [ranges.received_s[np.isin(ranges.status, FAULTS)] for ranges in columns]
-        return np.concatenate([np.zeros(0), *times_s])
-
-
-def read_recording(recording: Recording, backend: Corrector | None, timeline: Timeline) -> RangeTable:
-    """Read the messages of a recording into a timeline; return its ranges.
-
-    Args:
-        recording: the bag.
-        backend: corrects raw ranges; None: the recording contains corrected ranges.
-        timeline: is filled; may be shown meanwhile.
-    """
-    table, truths, feed = RangeTable(), Table(_TRUTH), SceneUpdater(timeline.scene)
-    for log_ns, topic, message, tag in recording.corrected_events(backend):
-        timeline.read_s = log_ns / NS_PER_S
-        if topic == topics.RANGE_RAW:
-            table.add_raw(message)
-            if len(message.cir.samples):
-                timeline.cirs_ns.setdefault((message.anchor_id, message.tag_id), []).append(log_ns)
-        elif topic == topics.RANGE_TRUTH:
-            truths.add(*message[0], message[1].range_m)
-        elif topic == topics.RANGE_CORRECTED:
-            table.add_corrected(*message)
-        if topic not in (topics.ANCHORS, topics.RANGE_RAW, topics.RANGE_TRUTH):
-            feed.add(topic, message, tag)
-    with timeline.scene.lock:
-        if recording.damage:
-            timeline.notices.append(f"{recording.damage}: nothing beyond can be shown")
-        _add_truths_and_levels(timeline.scene, table, truths.array())
-        timeline.read_s, timeline.is_read = recording.seconds, True
-        timeline.scene.incidents.check(recording.seconds)
-        _add_largest_error(timeline.scene)
-    return table
-
-
-def _add_truths_and_levels(scene: Scene, table: RangeTable, truths: NDArray[Any]) -> None:
-    """Set true ranges and levels, which a recording may contain in any order, and count the errors.
-
-    Args:
-        scene: with all corrected ranges.
-        table: the ranges.
-        truths: rows of `_TRUTH`.
-    """
-    ranges, measured = table.corrected.array(), table.raw.array()
-    true_m = np.append(truths["true_m"], np.nan)[match(ranges, truths)]
-    gap_db, rx_dbm = (
-        np.append(measured[name], np.nan)[match(ranges, measured)] for name in ("gap_db", "rx_dbm")
-    )
-    order, first = np.lexsort((ranges["tag"], ranges["anchor"])), 0
-    # By anchor and tag, as the ranges.
-    for _, history in sorted(scene.pairs.items()):
-        rows, columns = order[first : first + len(history.rows)], history.columns
-        first += len(rows)
-        columns.true_m[:], columns.gap_db[:], columns.rx_dbm[:] = true_m[rows], gap_db[rows], rx_dbm[rows]
-    scene.count_errors(np.stack([ranges["raw_m"], ranges["range_m"]]) - true_m)
-
-
-def estimate_tracks(
-    recording: Recording,
-    timeline: Timeline,
-    table: RangeTable,
-    config: EstimatorConfig,
-    stamp_offset_s: float = 0.0,
-    estimated: Sequence[TagTracks] = (),
-) -> None:
-    """Add estimated tracks, or the tracks of raw ranges if the recording contains positions, and residuals to a timeline.
-
-    Args:
-        recording: the bag.
-        timeline: what `read_recording` has read.
-        table: its result.
-        config: of the estimators.
-        stamp_offset_s: added to the stamps of the ranges.
-        estimated: tracks with `config` that are known already.
-    """
-    truths: dict[int | None, TruePath] = {}
-    with contextlib.suppress(RecordingError):
-        truths = read_truth(recording.path, recording.prefix + topics.ODOMETRY_TRUTH)
-    recorded, scene = table.by_tag(config.anchors, stamp_offset_s, truths), timeline.scene
-    by_tag = {one.recording.tag_id: one for one in estimated}
-    has_positions = bool(recording.contents & POSITIONS)
-    names = {name for name, kind in scene.tracks if kind is TrackKind.CORRECTED}
-    for tag in recorded.tags[:MAX_TAGS]:
-        of_tag = [history.rows for pair, history in scene.pairs.items() if pair[1] == tag.tag_id]
-        if not of_tag:
-            continue
-        name = tag_name(tag.tag_id, names, scene.pairs) or tag_frame(tag.tag_id)
-        tracks = dict[TrackKind, Track]()
-        if has_positions:
-            tracks[TrackKind.RAW] = live_track(config, tag.raw)
-        else:
-            try:
-                check_one_tag(config, recorded.tags)
-                estimate = by_tag.get(tag.tag_id) or track_tag(tag, config)
-            except (DatasetError, ParameterError) as error:
-                timeline.notices.append(str(error))
-                continue
-            timeline.estimates[name] = estimate
-            tracks = {kind: getattr(estimate, attribute) for kind, attribute in ATTRIBUTES.items()}
-            label, state = f"tag {format_id(tag.tag_id)}", str(estimate.determination)
-            timeline.notices += [
-                f"{label}{' determination' * (text == state)}: {text}" for text in estimate.warnings
-            ]
-        received_s, _, _, stamp_s, *_ = np.concatenate(of_tag).T
-        order = np.argsort(stamp_s, kind="stable")
-        for kind, track in tracks.items():
-            rows = np.full((len(track), POSITION), np.nan)
-            rows[:, 5] = track.stamp_ns / NS_PER_S - stamp_offset_s
-            rows[:, 0] = np.interp(rows[:, 5], stamp_s[order], received_s[order])
-            rows[:, 1:4] = track.position
-            rows[:, 4] = np.sqrt(track.covariance[:, 0, 0] + track.covariance[:, 1, 1])
-            if kind is TrackKind.CORRECTED:
-                rows[:, 6:9] = [horizontal_ellipse(covariance) for covariance in track.covariance]
-                _add_incidents(scene, tag_label(name, None), rows, recording.seconds)
-            with scene.lock:
-                scene.set_track(name, kind, rows)
-    # Tracks are those of the antenna, poses those of the robot.
-    is_of_robot = topics.POSE in recording.contents
-    add_residuals(scene, config.anchors, scene.lever_arms if is_of_robot else {})
-
-
-def _add_incidents(scene: Scene, label: str, track: NDArray[np.float64], seconds: float) -> None:
-    """Add the incidents of an estimated track until the end of the recording."""
-    incidents = Incidents()
-    for time_s, x, y in track[:, :3].tolist():
-        incidents.add_position(label, time_s, x, y)
-    incidents.check(seconds)
-    for incident in incidents.latest:
-        scene.incidents.add(*incident)
-    scene.incidents.count += incidents.count - len(incidents.latest)
 
 
 def add_residuals(

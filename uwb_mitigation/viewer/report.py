@@ -21,7 +21,7 @@ from uwb_mitigation.viewer.figures import HEADINGS, Figures, finish, new_figure
 from uwb_mitigation.viewer.page import TEMPLATES
 from uwb_mitigation.viewer.palette import TRACK_STYLES, TrackKind
 from uwb_mitigation.viewer.playback import BagPlayer
-from uwb_mitigation.viewer.recording import Displaced
+from uwb_mitigation.viewer.scene import Displaced
 from uwb_mitigation.viewer.state import Controls, PageState, View
 from uwb_mitigation.viewer.texts import ANCHOR_TITLES, TAG_TITLES, Texts
 

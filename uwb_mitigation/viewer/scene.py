@@ -10,7 +10,7 @@ import math
 import time
 from bisect import bisect_right
 from collections.abc import Callable, Container, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from threading import Lock
 
@@ -21,7 +21,9 @@ from uwb_mitigation.errors import format_id
 from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.online.measurements import TagHeight, TagRange
 from uwb_mitigation.positioning.online.tag_estimator import TagEstimator
+from uwb_mitigation.positioning.recorded_tracks import TagTracks
 from uwb_mitigation.types.anchors import MAX_ANCHORS, Anchor, AnchorMap
+from uwb_mitigation.types.measurement import Cir
 from uwb_mitigation.types.ros.poses import tag_frame
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.viewer.histories import (
@@ -34,7 +36,6 @@ from uwb_mitigation.viewer.histories import (
     Pair,
     Rows,
     Sample,
-    Trace,
     new_outages,
 )
 from uwb_mitigation.viewer.incidents import Incidents
@@ -73,7 +74,7 @@ class Pose:
         ellipse: horizontal 95 % ellipse: half axes (m) and angle of the major axis (rad); NaN: unknown.
         heading_rad: NaN: unknown.
         stamp_s, sd_m: time of the estimate, s, and horizontal standard deviation; NaN: unknown.
-        received_s: time of reception on the scene's clock; NaN: now.
+        received_s: time of reception on the scene's clock; `Scene.add_pose` sets it.
         speed: m/s, from the pose before.
     """
 
@@ -88,8 +89,6 @@ class Pose:
     speed: float = 0.0
 
 
-TrackPoint = tuple[float, float, float, float, float]
-"""Stamp (s), x, y, z and horizontal standard deviation (m)."""
 POSITION = 10
 """Number of columns of a track: time of reception on the scene's clock (s), x, y, z, horizontal standard deviation (m),
 stamp (s), and of a pose ellipse and heading; NaN: unknown."""
@@ -118,15 +117,6 @@ class NodeStatus:
         return replace(self, level=STALE, message=message, determinations=())
 
 
-@dataclass(slots=True)
-class MissingData:
-    """Messages of the page if there are no ranges, anchors or positions; empty: no message."""
-
-    ranges: str = "No ranges received."
-    anchors: str = "No anchor positions."
-    positions: str = ""
-
-
 class Scene:
     """All data that the page shows.
 
@@ -147,11 +137,13 @@ class Scene:
         reports: (time of reception, name, diagnostics) of a recording.
         latest_stamps: {tag: (its latest stamp, time of its reception)}.
         revision: increases with every change, so that a page draws only changes.
+        missing: why there are no ranges, anchors or positions.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic, is_whole: bool = False) -> None:
         self.lock, self.clock, self.stamp_clock, self.is_whole = Lock(), clock, time.time, is_whole
         self.anchors: dict[int, Anchor] = {}
+        self.missing = {"ranges": "No ranges received.", "anchors": "No anchor positions."}
         self.received_s, self.revision = math.nan, 0
         self.clear()
 
@@ -208,10 +200,10 @@ class Scene:
     def history(self, pair: Pair) -> History:
         """Return the history of a pair, a new one for a new pair."""
         self.revision += 1
-        return self.pairs.add(pair, self.pairs.get(pair) or History(outages=self._outages_of(pair[1])))
+        return self.pairs.touch(pair, lambda: History(outages=self._outages_of(pair[1])))
 
     def _outages_of(self, tag_id: int | None) -> Rows:
-        return self._outages.add(tag_id, self._outages.get(tag_id) or new_outages())
+        return self._outages.touch(tag_id, new_outages)
 
     def add_sample(self, pair: Pair, sample: Sample) -> None:
         """Add a corrected range.
@@ -260,44 +252,35 @@ class Scene:
             columns.true_m[row] = true_m
             self.count_errors(np.array([columns.raw_m[[row]], columns.corrected_m[[row]]]) - true_m)
 
-    def set_trace(self, pair: Pair, trace: Trace) -> None:
+    def set_cir(self, pair: Pair, cir: Cir) -> None:
         """Set the last CIR of a pair; those of a recording stay in the bag."""
         if not self.is_whole:
-            self.history(pair).trace = trace
+            self.history(pair).cir = cir
 
-    def add_pose(self, tag: str, pose: Pose) -> None:
-        """Set the pose of a tag."""
-        if _is_plausible(pose.x, pose.y, pose.z):
-            if (before := self.tags.get(tag[:MAX_TEXT])) is not None:
-                passed_s = pose.stamp_s - before.stamp_s
-                moved_m = math.dist((pose.x, pose.y), (before.x, before.y))
-                pose.speed = moved_m / passed_s if passed_s > 0.0 else before.speed
-            if math.isnan(pose.received_s):
-                pose.received_s = self.clock()
-            self.tags.add(tag[:MAX_TEXT], pose)
-            self.incidents.add_position(tag_label(tag[:MAX_TEXT], None), pose.received_s, pose.x, pose.y)
-            point = (pose.stamp_s, pose.x, pose.y, pose.z, pose.sd_m)
-            self.add_position(tag, TrackKind.CORRECTED, point, (*pose.ellipse, pose.heading_rad))
-
-    def add_position(
-        self, tag: str, kind: TrackKind, point: TrackPoint, shape: tuple[float, ...] = (math.nan,) * 4
-    ) -> None:
-        """Append a position to a track; `tag` is its name, `shape` ellipse and heading of a pose."""
+    def add_pose(self, tag: str, pose: Pose, kind: TrackKind = TrackKind.CORRECTED) -> None:
+        """Append a pose to a track; a corrected one is the latest pose of its tag."""
         self.revision += 1
-        stamp_s, x, y, z, sd_m = point
-        if not (_is_plausible(x, y, z) and math.isfinite(stamp_s)):
+        x, y, z, stamp_s, name = pose.x, pose.y, pose.z, pose.stamp_s, tag[:MAX_TEXT]
+        if not _is_plausible(x, y, z):
             return
-        key = tag[:MAX_TEXT], kind
-        track = self.tracks.add(key, self.tracks.get(key) or Rows(np.empty((0, POSITION))))
-        row = self.clock(), x, y, z, sd_m, stamp_s, *shape
+        pose.received_s = self.clock()
+        if kind is TrackKind.CORRECTED:
+            before = self.tags.get(name, pose)
+            passed_s, moved_m = stamp_s - before.stamp_s, math.dist((x, y), (before.x, before.y))
+            pose.speed = moved_m / passed_s if passed_s > 0.0 else before.speed
+            self.tags.add(name, pose)
+            self.incidents.add_position(tag_label(name, None), pose.received_s, x, y)
+        if not math.isfinite(stamp_s):
+            return
+        track = self.tracks.touch((name, kind), lambda: Rows(np.empty((0, POSITION))))
+        row = pose.received_s, x, y, z, pose.sd_m, stamp_s, *pose.ellipse, pose.heading_rad
         if self.is_whole:
             track.append(row)
             return
-        latest = track.rows[-1].tolist() if len(track.rows) else [-math.inf] * POSITION
-        step_s, step_m = stamp_s - latest[5], math.dist(latest[1:3], (x, y))
+        step_s, step_m = stamp_s - track.last[5], math.dist(track.last[1:3], (x, y))
         if step_s < -1.0:
-            self.set_track(tag, kind, np.array([row]))
-        elif step_s >= STEP_S and (step_m >= STEP_M or step_s >= 5 * STEP_S):
+            self.set_track(name, kind, np.array([row]))
+        elif not (step_s < STEP_S or (step_m < STEP_M and step_s < 5 * STEP_S)):
             track.append(row, MAX_TRACK)
 
     def set_track(self, tag: str, kind: TrackKind, rows: NDArray[np.float64]) -> None:
@@ -358,9 +341,9 @@ class Scene:
         row = self._anchor_map.index[pair[0]]
         estimate = estimator.add(TagRange(round(sample.stamp_s * NS_PER_S), row, sample.raw_m))
         if estimate is not None:
-            name = tag_frame(pair[1])
-            point = (sample.stamp_s, *estimate.position.tolist(), math.nan)
-            self.add_position(name if name in self.tags else DEFAULT_TAG, TrackKind.RAW, point)
+            name, (x, y, z) = tag_frame(pair[1]), estimate.position.tolist()
+            name = name if name in self.tags else DEFAULT_TAG
+            self.add_pose(name, Pose(x, y, z, stamp_s=sample.stamp_s), TrackKind.RAW)
 
     def set_anchors(self, anchors: Iterable[Anchor]) -> None:
         """Set the anchors on Earth; the height of an anchor may be NaN."""
@@ -406,6 +389,33 @@ class Scene:
     def tag_of(self, tag_id: int) -> Pose | None:
         """Return the position of the tag of a range; None: it has none."""
         return self.tags.get(tag_name(tag_id, self.tags, self.pairs))
+
+
+Displaced = dict[int, tuple[float, Anchor]]
+"""{anchor whose ranges fit another position: (its median held-out residual, m, the anchor there)}."""
+
+
+@dataclass
+class Timeline:
+    """Everything that does not depend on the time that a page shows: of a recording, or of live topics.
+
+    Attributes:
+        scene: its data.
+        is_read: whether it has been read completely.
+        is_complete: whether tracks, residuals and all incidents have been added.
+        cirs_ns: {pair: log time of each raw range with a CIR}.
+        notices: messages for the page.
+        estimates: {tag: its estimated tracks}, if a recording contains no positions.
+        displaced: the anchor whose ranges fit another position.
+    """
+
+    scene: Scene
+    is_read: bool = False
+    is_complete: bool = False
+    cirs_ns: dict[Pair, list[int]] = field(default_factory=dict)
+    notices: list[str] = field(default_factory=list)
+    estimates: dict[str, TagTracks] = field(default_factory=dict)
+    displaced: Displaced = field(default_factory=dict)
 
 
 def antenna_position(

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from bokeh.core.properties import Any as AnyValue
 from bokeh.model import DataModel
 from bokeh.models import ColumnDataSource
 
-from uwb_mitigation.viewer.histories import HISTORY_S, MAX_RANGE_M, History, Pair, Trace
-from uwb_mitigation.viewer.scene import MissingData, Scene
+from uwb_mitigation.types.measurement import Cir
+from uwb_mitigation.viewer.histories import HISTORY_S, History, Pair
+from uwb_mitigation.viewer.scene import Scene, Timeline
 
 if TYPE_CHECKING:
     from uwb_mitigation.viewer.playback import BagPlayer
-    from uwb_mitigation.viewer.recording import Timeline
 
 
-@dataclass(slots=True)
+@dataclass
 class View:
     """State that all pages of a server share.
 
@@ -27,7 +26,7 @@ class View:
         scene: what they show.
         window: number of samples that the network reads.
         player: player of a recording; None: live.
-        missing: the reasons for an empty page.
+        timeline: the content of the recording, or of the live topics.
         pages: number of open pages.
     """
 
@@ -35,27 +34,16 @@ class View:
     title: str = "UWB ranges"
     window: int = 157
     player: BagPlayer | None = None
-    missing: MissingData = field(default_factory=MissingData)
     pages: int = 0
 
     def __post_init__(self) -> None:
-        if self.player is not None:
-            self.missing = self.player.missing
-
-    @property
-    def timeline(self) -> Timeline | None:
-        """The content of the recording; None: live, or not read completely."""
-        return self.player.timeline if self.player is not None and self.player.timeline.is_read else None
-
-    @property
-    def complete(self) -> Timeline | None:
-        """The content of the recording with its tracks; None: live, or not ready."""
-        return self.timeline if self.timeline is not None and self.timeline.is_complete else None
+        live = Timeline(self.scene, is_read=True, is_complete=True)
+        self.timeline: Timeline = live if self.player is None else self.player.timeline
 
     @property
     def all_data(self) -> Scene:
         """All data: of the recording as soon as it has been read, else those of the scene."""
-        return self.scene if self.timeline is None else self.timeline.scene
+        return self.timeline.scene if self.timeline.is_read else self.scene
 
 
 class Controls(DataModel):  # type: ignore[misc]
@@ -63,8 +51,8 @@ class Controls(DataModel):  # type: ignore[misc]
 
     Attributes:
         command: set by the script: name, arguments, and a number that makes it unique.
-        update: set by the server after each update: its number, how long the previous one took, and the age of the
-            latest range by its reception and by its stamp, s; the age is negative if there are no recent ranges.
+        update: set by the server after each update: its number, how long the previous one took, and the time since the
+            latest range was received, s; negative if there are no recent ranges.
         acknowledged: set by the script to the number of the last update that it has drawn.
         headline, verdict, notice, nodes, health, tag_rows, incidents, cards, player, selected, marks: set by the server.
         available: set by the server: whether a control has an effect, {id: bool}.
@@ -121,27 +109,24 @@ class PageState:
         return self.view.scene.pairs.get(self.selected or (-1, -1)) or History()
 
     @property
-    def trace(self) -> Trace | None:
+    def cir(self) -> Cir | None:
         """The last CIR of the selected pair."""
         player = self.view.player
-        return player.read_trace(self.selected) if player and self.selected else self.history.trace
+        return player.read_cir(self.selected) if player and self.selected else self.history.cir
 
     def changed(self, name: str, value: object) -> bool:
         """Return whether a value differs from that of the last call."""
-        if name in self._drawn and self._drawn[name] == value:
-            return False
-        self._drawn[name] = value
-        return True
+        before, self._drawn[name] = self._drawn.get(name, self), value
+        return before != value
 
     def forget(self, name: str) -> None:
         """Let the next call of `changed` return True."""
         self._drawn.pop(name, None)
 
     def set(self, **values: object) -> None:
-        """Set attributes of the controls that have changed."""
+        """Set attributes of the controls; Bokeh sends those that have changed."""
         for name, value in values.items():
-            if getattr(self.controls, name) != value:
-                setattr(self.controls, name, value)
+            setattr(self.controls, name, value)
 
 
 def new_source(*columns: str, **options: Any) -> ColumnDataSource:
@@ -149,13 +134,13 @@ def new_source(*columns: str, **options: Any) -> ColumnDataSource:
     return ColumnDataSource({column: [] for column in columns}, **options)
 
 
+def columns_of(source: ColumnDataSource, rows: Sequence[Sequence[Any]]) -> dict[str, list[Any]]:
+    """Return rows as the columns of a source."""
+    columns = map(list, zip(*rows, strict=True)) if rows else ([] for _ in source.data)
+    return dict(zip(source.data, columns, strict=True))
+
+
 def set_rows(source: ColumnDataSource, rows: Sequence[Sequence[Any]]) -> None:
-    """Set the rows of a source, unless it is and remains empty."""
-    if rows or any(map(len, source.data.values())):
-        columns = map(list, zip(*rows, strict=True)) if rows else ([] for _ in source.data)
-        source.data = dict(zip(source.data, columns, strict=True))
-
-
-def drawable(value_m: float) -> float:
-    """Return NaN for a length that would make all others invisible."""
-    return value_m if abs(value_m) < MAX_RANGE_M else math.nan
+    """Set the rows of a source, which contain no arrays, if they have changed."""
+    if (columns := columns_of(source, rows)) != source.data:
+        source.data = columns

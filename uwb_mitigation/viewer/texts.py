@@ -39,7 +39,7 @@ COLUMNS = {
 """Columns of the table of pairs after anchor and tag: {field: (title, interval, description)}."""
 
 ANCHOR_TITLES = "state", "anchor", "rate, Hz", "NLOS, %", "residual, m", "lost, %", "advice"
-TAG_TITLES = "tag", "position", "x, y, z, m", "sd, m", "age", "ranges, Hz", "range age by stamp"
+TAG_TITLES = "tag", "position", "x, y, z, m", "sd, m", "age", "ranges, Hz"
 """Columns of the tables of anchors and of tags."""
 MAX_SHOWN_EVENTS = 8
 
@@ -61,7 +61,8 @@ class Texts:
     def draw(self, scene: Scene) -> None:
         """Write the texts of a scene."""
         page, timeline = self._page, self._view.timeline
-        if timeline is None or page.changed("cards", (page.tag_id, timeline.is_complete)):
+        state = page.tag_id, timeline.is_read, timeline.is_complete
+        if self._view.player is None or page.changed("cards", state):
             self._cards = cards(self._view, page.tag_id)
         pairs = self._pairs(scene)
         anchors = health.anchor_means(pairs)
@@ -102,7 +103,7 @@ class Texts:
 
     def _pairs(self, scene: Scene) -> dict[Pair, Means]:
         """Write the table of pairs; return their means."""
-        displaced = self._view.timeline.displaced if self._view.timeline else {}
+        displaced = self._view.timeline.displaced
         rows, pairs = list[tuple[Any, ...]](), dict[Pair, Means]()
         for pair, history, sample in scene.latest():
             missing, age_s = scene.no_data(history), scene.age_s(history)
@@ -142,8 +143,8 @@ class Texts:
         texts = (f"{tag} determination: ", f"{tag}: {UNKNOWN_POSITION} ")
         remedies = (line.partition(text)[2] for text in texts for line in notices if text in line)
         verdict = health.verdict(scene, tag_id, anchors, states, next(remedies, ""))
-        is_read = self._view.player is None or self._view.complete is not None
-        if verdict.state in (health.UNDETERMINED, health.WAITING) and not is_read:
+        is_complete = self._view.timeline.is_complete
+        if verdict.state in (health.UNDETERMINED, health.WAITING) and not is_complete:
             verdict = Verdict(health.WAITING, "the recording is being read")
         return self._verdicts[tag_id].update(verdict, scene.clock())
 
@@ -163,15 +164,10 @@ class Texts:
 
     def _notices(self, scene: Scene) -> list[str]:
         """Return the reasons for an empty page, and what needs attention."""
-        histories = [history for _, history, _ in scene.latest()]
-        missing, timeline, lines = self._view.missing, self._view.timeline, []
-        if not histories:
-            lines.append(missing.ranges)
-        elif not self._page.has_data:
-            lines.append(f"No ranges for {min(map(scene.age_s, histories)):.0f} s.")
-        lines.append("" if scene.anchors else missing.anchors)
-        lines.append("" if scene.tags or scene.tracks else missing.positions)
-        if timeline is not None:
+        timeline, has_positions = self._view.timeline, scene.tags or scene.tracks
+        shown = {"ranges": any(scene.latest()), "anchors": scene.anchors, "positions": has_positions}
+        lines = [text for name, text in scene.missing.items() if not shown[name]]
+        if timeline.is_read:
             lines += timeline.notices
             lines.append("" if timeline.is_complete else "Estimating the tracks of the recording ...")
         for status in scene.node_statuses.values():
@@ -198,14 +194,13 @@ def _tag_rows(scene: Scene, pairs: dict[Pair, Means], verdicts: dict[int | None,
         place, sd_m, age = f"{pose.x:.2f}, {pose.y:.2f}, {pose.z:.2f}", pose.sd_m, f"{age_s:.1f} s"
         if age_s > NO_DATA_S:
             place, sd_m, age = f"last: {place}", math.nan, f"no data for {age_s:.0f} s"
-        rows[label] = [label, "-", place, _number(sd_m, 2), age, "-", "-"]
+        rows[label] = [label, "-", place, _number(sd_m, 2), age, "-"]
     for tag_id in sorted({tag_id for _, tag_id in pairs}):
         label, name = f"tag {format_id(tag_id)}", tag_name(tag_id, scene.tags, pairs)
         label = tag_label(name, plain_id) if name else label
-        row = rows.setdefault(label, [label, "", "-", "-", "no position", "", ""])
+        row = rows.setdefault(label, [label, "", "-", "-", "no position", ""])
         rate_hz = sum(np.nan_to_num(means["rate"]) for (_, tag), means in pairs.items() if tag == tag_id)
-        row[1] = verdicts[tag_id].state
-        row[5:] = _number(rate_hz, 1), f"{scene.stamp_clock() - scene.latest_stamp_s(tag_id):.1f} s"
+        row[1], row[5] = verdicts[tag_id].state, _number(rate_hz, 1)
     return list(rows.values())
 
 

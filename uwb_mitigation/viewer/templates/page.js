@@ -21,11 +21,11 @@ function start(doc) {
   // The next update comes after this one has been drawn: a slow page skips updates instead of showing old ones.
   let received = performance.now();
   const showAge = () => {
-    const player = controls.player, [, took, rangeAge, stampAge] = controls.update ?? [0, 0, -1, null], age = (performance.now() - received) / 1000 + took;
+    const player = controls.player, [, took, rangeAge] = controls.update ?? [0, 0, -1], age = (performance.now() - received) / 1000 + took;
     const late = player?.behind ? "Reading ..." : age > 2 && (player?.playing ?? true) ? `${age.toFixed(0)} s behind`
       : player?.playing && !position && rangeAge < 0 ? "NO RANGES" : "";
     $("age").className = late ? "late" : "";
-    setText($("age"), late || (!player?.playing ? "PAUSED" : position ? "PLAYING" : `LIVE ${(age + rangeAge).toFixed(1)} s${Math.abs(stampAge - rangeAge) > 1 ? `, stamps ${Math.abs(stampAge) < 1e5 ? (age + stampAge).toFixed(1) : "> 1e5"} s old` : ""}`));
+    setText($("age"), late || (!player?.playing ? "PAUSED" : position ? "PLAYING" : `LIVE ${(age + rangeAge).toFixed(1)} s`));
   };
   on("update", () => {
     received = performance.now();
@@ -136,9 +136,8 @@ function start(doc) {
   if (matchMedia("(pointer: coarse)").matches)
     for (const figure of figures) for (const tool of figure.toolbar.tools) if (tool.event_types?.includes("pan")) tool.active = false;
 
-  const legend = (figure) => [...figure.above, ...figure.below].find((part) => part.items);
-  for (const figure of figures) if (legend(figure)) new ResizeObserver(([{contentRect: {width}}]) => {
-    legend(figure).ncols = Math.max(2, Math.floor((width - 40) / 110));
+  for (const figure of figures) new ResizeObserver(([{contentRect: {width}}]) => {
+    for (const part of [...figure.above, ...figure.below]) if (part.items) part.ncols = Math.max(2, Math.floor((width - 40) / 110));
   }).observe($(figure.name));
 
   $("map").addEventListener("click", (event) => {
