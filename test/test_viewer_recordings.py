@@ -14,6 +14,7 @@ from drawn import Clock, Drawn, corrected_bag
 from drives import HALL, drive
 
 from uwb_mitigation.commands.offline.track import displaced_anchor
+from uwb_mitigation.positioning import health
 from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.recordings import recorded_ranges
 from uwb_mitigation.recordings.bag.writer import BagWriter
@@ -31,7 +32,6 @@ from uwb_mitigation.types.ros.topics import (
     RANGE_TRUTH,
     RANGE_TRUTH_TYPE,
 )
-from uwb_mitigation.viewer import health
 from uwb_mitigation.viewer.figures import MAX_POINTS, thinned
 from uwb_mitigation.viewer.headline import Positions
 from uwb_mitigation.viewer.histories import Sample

@@ -10,17 +10,19 @@ import numpy as np
 import pytest
 from drawn import Clock, Drawn
 
+from uwb_mitigation.positioning import health
 from uwb_mitigation.positioning.geometry import dop
+from uwb_mitigation.positioning.health import DEGRADED, POSITION_GOOD, Verdict
 from uwb_mitigation.types.anchors import Anchor
 from uwb_mitigation.types.measurement import Status
-from uwb_mitigation.viewer import health, palette
+from uwb_mitigation.viewer import palette
 from uwb_mitigation.viewer.feed import SceneUpdater
-from uwb_mitigation.viewer.health import DEGRADED, POSITION_GOOD, HeldVerdict, Verdict
 from uwb_mitigation.viewer.histories import Sample
 from uwb_mitigation.viewer.incidents import Incidents
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.scene import NodeStatus, Pose, Scene
 from uwb_mitigation.viewer.state import View
+from uwb_mitigation.viewer.verdict import LOOKS, HeldVerdict, predicted_accuracy
 
 CIRCLE = NodeStatus(1, "", math.nan, ("tag 7 determination: circle: R. Remedy: more anchors",))
 ANCHORS = {1: (0.0, 0.0), 2: (8.0, 0.0), 3: (0.0, 6.0), 4: (8.0, 6.0)}
@@ -292,7 +294,7 @@ def test_map_has_heading_ellipse_and_a_legend_of_what_it_contains():
             item.label.value for item in items if hasattr(item.label, "value")
         }
 
-    assert legend() == {"raw", "corrected", "true", "OK", "tag", *health.LOOKS}
+    assert legend() == {"raw", "corrected", "true", "OK", "tag", *LOOKS}
     assert page.column("map", "ink") == [palette.PAPER, *[palette.NIGHT] * 3], "the selected anchor"
     scene.add_pose("tag_7", Pose(4, 3, 1, (0.4, 0.2, 0.3), 0.5, stamp_s=1003.0))
     page.send("draw")
@@ -309,10 +311,10 @@ def test_predicted_accuracy_is_shown_on_request():
     page.send("accuracy", False)
     assert page.column("map", "step") == []
     anchors = np.array([[0.0, 0.0, 1.0], [8.0, 0.0, 1.0], [8.0, 8.0, 1.0], [0.0, 8.0, 1.0]])
-    x, y, image = health.predicted_accuracy(anchors, 1.0, 0.1)
+    x, y, image = predicted_accuracy(anchors, 1.0, 0.1)
     place = np.array([x[20], y[25], 1.0])
     assert image[25, 20] == pytest.approx(0.1 * dop(anchors, place, level=True).hdop, rel=1e-5)
-    assert np.isinf(health.predicted_accuracy(anchors[:1], 1.0, 0.1)[2]).all()
+    assert np.isinf(predicted_accuracy(anchors[:1], 1.0, 0.1)[2]).all()
 
 
 @pytest.mark.parametrize(

@@ -19,10 +19,12 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
+from uwb_mitigation.positioning import health
+from uwb_mitigation.positioning.health import NO_DATA_S
 from uwb_mitigation.types.measurement import FAULTS, Encoding, Status
-from uwb_mitigation.viewer import health, palette
+from uwb_mitigation.viewer import palette
 from uwb_mitigation.viewer.headline import Positions
-from uwb_mitigation.viewer.histories import HISTORY_S, MAX_RANGE_M, NO_DATA_S
+from uwb_mitigation.viewer.histories import HISTORY_S, MAX_RANGE_M
 from uwb_mitigation.viewer.palette import BLUE, GREEN, GREY, NIGHT, PAPER, VERMILLION, TrackKind
 from uwb_mitigation.viewer.scene import (
     ERROR_EDGES_M,
@@ -32,6 +34,7 @@ from uwb_mitigation.viewer.scene import (
     tag_label,
 )
 from uwb_mitigation.viewer.state import PageState, columns_of, new_source, set_rows
+from uwb_mitigation.viewer.verdict import LOOKS, STEPS_M, predicted_accuracy
 
 HEADINGS = {
     "map": "Map",
@@ -308,7 +311,7 @@ class Map:
         plot.add_tools(models.HoverTool(tooltips=tips, renderers=named))
         # States have a legend of their own, whose height never changes; a report without ranges has no states.
         (legend,), has_states = plot.legend, math.isfinite(page.trail_s) or len(page.view.scene.pairs) > 0
-        states = [item for item in legend.items if getattr(item.label, "value", "") in health.LOOKS]
+        states = [item for item in legend.items if getattr(item.label, "value", "") in LOOKS]
         self._items = legend.items = [item for item in legend.items if item not in states]
         plot.add_layout(models.Legend(items=states, visible=has_states), "below")
         finish(plot)
@@ -330,7 +333,7 @@ class Map:
         ]  # fmt: skip
         # The legend has all states, whatever the anchors have: it needs data, which are nowhere.
         nowhere, anchors = ColumnDataSource({"x": [math.nan], "y": [math.nan]}), []
-        for state, (marker, colour) in health.LOOKS.items():
+        for state, (marker, colour) in LOOKS.items():
             outline = GREY if state == health.SILENT else NIGHT
             style = {"marker": marker, "size": 15, "line_color": outline, "fill_color": colour}
             view = CDSView(filter=GroupFilter(column_name="health", group=state))
@@ -467,10 +470,10 @@ class Map:
         if not self._page.changed("accuracy", inputs):
             return
         if inputs is not None:
-            image = health.predicted_accuracy(anchors, height_m, inputs[-1])
-            areas = contour_data(*image, [0.0, *health.STEPS_M], want_line=False).fill_data
+            image = predicted_accuracy(anchors, height_m, inputs[-1])
+            areas = contour_data(*image, [0.0, *STEPS_M], want_line=False).fill_data
             for xs, ys, limit_m in zip(areas.xs, areas.ys, areas.upper_levels, strict=True):
-                colour = cividis(len(health.STEPS_M))[health.STEPS_M.index(limit_m)]
+                colour = cividis(len(STEPS_M))[STEPS_M.index(limit_m)]
                 rows.append((xs, ys, colour, f"sd \u2264 {limit_m:g} m"))
         self._accuracy.data = columns_of(self._accuracy, rows)
 

@@ -14,13 +14,13 @@ from bokeh.events import Reset
 
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.types.measurement import FAULTS
-from uwb_mitigation.viewer import health
 from uwb_mitigation.viewer.figures import HEADINGS, Figures
 from uwb_mitigation.viewer.histories import Pair
 from uwb_mitigation.viewer.palette import STATUS_LOOKS, TAG_COLOURS
 from uwb_mitigation.viewer.scene import Scene
 from uwb_mitigation.viewer.state import PageState, View
 from uwb_mitigation.viewer.texts import COLUMNS, TAG_TITLES, Texts
+from uwb_mitigation.viewer.verdict import STATES
 
 REFRESH_S = 0.1
 FAST_PAGES = 3
@@ -64,7 +64,7 @@ class Page:
             recording=player is not None,
             nonce=nonce,
             columns=COLUMNS,
-            states=health.STATES,
+            states=STATES,
             tag_titles=TAG_TITLES,
             figures=HEADINGS,
             tag_colours=TAG_COLOURS,

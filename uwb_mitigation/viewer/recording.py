@@ -19,6 +19,7 @@ from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError, 
 from uwb_mitigation.mitigation.correction import Corrector
 from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.geometry import horizontal_ellipse
+from uwb_mitigation.positioning.health import NO_DATA_S
 from uwb_mitigation.positioning.online.robot_estimator import live_track
 from uwb_mitigation.positioning.recorded_tracks import TagTracks, check_one_tag, track_tag
 from uwb_mitigation.recordings.bag.pose_paths import read_truth
@@ -32,7 +33,7 @@ from uwb_mitigation.types.ros.poses import tag_frame
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import TruePath
 from uwb_mitigation.viewer.feed import DECODERS, SceneUpdater
-from uwb_mitigation.viewer.histories import MAX_RANGE_M, NO_DATA_S, Pair, RangeColumns, plausible_cir
+from uwb_mitigation.viewer.histories import MAX_RANGE_M, Pair, RangeColumns, plausible_cir
 from uwb_mitigation.viewer.palette import ATTRIBUTES, TrackKind
 from uwb_mitigation.viewer.scene import (
     DEFAULT_TAG,

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.positioning.config import EstimatorConfig
+from uwb_mitigation.positioning.health import NO_DATA_S
 from uwb_mitigation.positioning.online.measurements import TagHeight, TagRange
 from uwb_mitigation.positioning.online.tag_estimator import TagEstimator
 from uwb_mitigation.positioning.recorded_tracks import TagTracks
@@ -30,7 +31,6 @@ from uwb_mitigation.viewer.histories import (
     HISTORY_S,
     MAX_RANGE_M,
     MAX_SAMPLES,
-    NO_DATA_S,
     BoundedDict,
     History,
     Pair,

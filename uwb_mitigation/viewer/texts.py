@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 
 from uwb_mitigation.errors import format_id
+from uwb_mitigation.positioning import health
 from uwb_mitigation.positioning.determination import UNKNOWN_POSITION
-from uwb_mitigation.viewer import health
+from uwb_mitigation.positioning.health import NO_DATA_S, Means, Verdict
 from uwb_mitigation.viewer.headline import Card, cards
-from uwb_mitigation.viewer.health import HeldVerdict, Means, Verdict
-from uwb_mitigation.viewer.histories import HISTORY_S, NO_DATA_S, RATE_RANGES, STATISTICS, Pair
+from uwb_mitigation.viewer.histories import HISTORY_S, RATE_RANGES, STATISTICS, Pair
 from uwb_mitigation.viewer.scene import Scene, plain_tag_id, tag_label, tag_name
 from uwb_mitigation.viewer.state import PageState, new_source, set_rows
+from uwb_mitigation.viewer.verdict import STATES, HeldVerdict, anchor_means, verdict
 
 LEVELS = ("OK", "WARN", "ERROR", "STALE")
 """Texts of the diagnostic levels."""
@@ -23,7 +24,7 @@ LEVELS = ("OK", "WARN", "ERROR", "STALE")
 _RANGES = f"last {STATISTICS} ranges"
 
 COLUMNS = {
-    "state": ("state", "", health.STATES),
+    "state": ("state", "", STATES),
     "status": ("status", "last range", "whether the network could correct the range"),
     "raw": ("raw, m", "last range", "measured range"),
     "corrected": ("corrected, m", "last range", "corrected range"),
@@ -65,7 +66,7 @@ class Texts:
         if self._view.player is None or page.changed("cards", state):
             self._cards = cards(self._view, page.tag_id)
         pairs = self._pairs(scene)
-        anchors = health.anchor_means(pairs)
+        anchors = anchor_means(pairs)
         # If no anchor answers, the cause is not in each of them.
         is_lost = all(means["stopped"] > 0.0 for means in anchors.values())
         states = dict.fromkeys(scene.anchors, health.SILENT) | {
@@ -142,11 +143,11 @@ class Texts:
         tag = f"tag {'' if tag_id is None else format_id(tag_id)}"
         texts = (f"{tag} determination: ", f"{tag}: {UNKNOWN_POSITION} ")
         remedies = (line.partition(text)[2] for text in texts for line in notices if text in line)
-        verdict = health.verdict(scene, tag_id, anchors, states, next(remedies, ""))
+        current = verdict(scene, tag_id, anchors, states, next(remedies, ""))
         is_complete = self._view.timeline.is_complete
-        if verdict.state in (health.UNDETERMINED, health.WAITING) and not is_complete:
-            verdict = Verdict(health.WAITING, "the recording is being read")
-        return self._verdicts[tag_id].update(verdict, scene.clock())
+        if current.state in (health.UNDETERMINED, health.WAITING) and not is_complete:
+            current = Verdict(health.WAITING, "the recording is being read")
+        return self._verdicts[tag_id].update(current, scene.clock())
 
     def _facts(self, scene: Scene, accuracy: str) -> str:
         """Return accuracy and age, and a line for each other interval: what the correction changes, share of corrected ranges."""

@@ -1,4 +1,4 @@
-"""The verdict on the position of a tag in the diagnostics of the locator, by the rules and with the sentences of the viewer."""
+"""The verdict on the position of a tag in the diagnostics of the locator, by the rules and with the sentences of `positioning.health`."""
 
 from __future__ import annotations
 
@@ -10,17 +10,16 @@ from collections.abc import Callable
 import numpy as np
 
 from uwb_mitigation.errors import format_id
+from uwb_mitigation.positioning import health
 from uwb_mitigation.positioning.determination import current_determination
+from uwb_mitigation.positioning.health import LONG_M, NO_DATA_S, Means, Verdict
 from uwb_mitigation.positioning.multi_tag import TagState
 from uwb_mitigation.types.anchors import Anchor
 from uwb_mitigation.types.measurement import CorrectedRange
 from uwb_mitigation.types.tracks import Estimate
-from uwb_mitigation.viewer import health
-from uwb_mitigation.viewer.health import LONG_M, RADIUS95, Means, Verdict
-from uwb_mitigation.viewer.histories import HISTORY_S, NO_DATA_S
 
-MAX_RANGES = 50
-"""Number of latest ranges of an anchor whose mean residual is compared with the limits."""
+MAX_RANGES, RECENT_S = 50, 60.0
+"""Number of latest ranges of an anchor whose mean residual is compared with the limits, and the time after which an anchor is forgotten."""
 
 
 class PositionMonitor:
@@ -66,27 +65,14 @@ class PositionMonitor:
         if estimate is None:
             reason = f"no position of {self.name}" if current.is_unique else statement
             return Verdict(health.UNDETERMINED, reason, remedy and f"Remedy: {remedy}")
-        sd_m = math.sqrt(np.trace(estimate.covariance[:2, :2]))
-        accuracy = f"horizontal sd {sd_m:.2f} m, 95 % within {RADIUS95 * sd_m:.2f} m"
-        anchors = self._means()
-        common, texts = health.advice(anchors, {anchor.id: anchor.name for anchor in self._residuals})
-        bad = [key for key, means in anchors.items() if health.state(means) == health.BAD]
-        reason, action = "", ""
-        if not current.is_unique:
-            reason, action = statement, remedy and f"Remedy: {remedy}"
-        elif common or bad:
-            worst = max(
-                bad, key=lambda key: [abs(anchors[key][n]) for n in ("stopped", "residual")], default=0
-            )
-            reason, _, action = (common or texts[worst]).partition(": ")
-            if not common and sum(abs(means["residual"]) > LONG_M for means in anchors.values()) > 1:
-                action += " Several anchors read wrong: check height and lever arm of the tag, too."
-        elif sd_m > health.MAX_SD_M:
-            reason, action = (
-                f"uncertain by {sd_m:.2f} m",
-                "Add an anchor, or set height and area of the locator.",
-            )
-        return Verdict(health.DEGRADED if reason else health.POSITION_GOOD, reason, action, accuracy)
+        sd_m, anchors = math.sqrt(np.trace(estimate.covariance[:2, :2])), self._means()
+        reason, action = statement, remedy and f"Remedy: {remedy}"
+        if current.is_unique:
+            states = {key: health.state(means) for key, means in anchors.items()}
+            names = {anchor.id: anchor.name for anchor in self._residuals}
+            reason, action = health.degradation(anchors, states, names, sd_m)
+        state = health.DEGRADED if reason else health.POSITION_GOOD
+        return Verdict(state, reason, action, health.accuracy_text(sd_m))
 
     def sentence(self) -> tuple[bool, str]:
         """Return whether the position is good, and the verdict as text."""
@@ -102,7 +88,7 @@ class PositionMonitor:
         for anchor, rows in self._residuals.items():
             received_s, residual_m, is_uncertain = np.array(rows).T
             age_s, known_m = now_s - float(received_s[-1]), residual_m[np.isfinite(residual_m)]
-            if age_s < HISTORY_S:
+            if age_s < RECENT_S:
                 result[anchor.id] = dict.fromkeys(("rate", "lost", "not_ok", "displaced"), 0.0) | {
                     "residual": float(known_m.mean()) if len(known_m) else math.nan,
                     "evidence": float(len(known_m)),
