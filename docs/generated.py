@@ -137,7 +137,7 @@ def _message(path: Path) -> Iterator[str]:
 def thresholds() -> str:
     """Return the rows of the table of warnings of the mitigator."""
     # Importing the module would need ROS.
-    source = ast.parse((PACKAGE / "nodes" / "support" / "diagnostics.py").read_text(encoding="utf-8"))
+    source = ast.parse((PACKAGE / "nodes" / "support" / "mitigator_health.py").read_text(encoding="utf-8"))
     calls = [node.value for node in source.body if isinstance(node, ast.Assign)]
     rows = [
         [ast.literal_eval(argument) for argument in call.args]
@@ -145,7 +145,7 @@ def thresholds() -> str:
         if isinstance(call, ast.Call) and ast.unparse(call.func) == "Threshold"
     ]
     if not rows:
-        raise ValueError("nodes/support/diagnostics.py defines no thresholds")
+        raise ValueError("nodes/support/mitigator_health.py defines no thresholds")
     return "\n".join(f"| WARN | {fact} above {limit:g} | {text} |" for fact, limit, text in rows)
 
 

@@ -24,8 +24,8 @@ from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
-from uwb_mitigation.nodes.support import diagnostics
-from uwb_mitigation.nodes.support.diagnostics import LossCounter, MitigatorHealth
+from uwb_mitigation.nodes.support import diagnostics, mitigator_health
+from uwb_mitigation.nodes.support.mitigator_health import LossCounter, MitigatorHealth
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.measurement import Status
 from uwb_mitigation.types.ros.codec import encode_range
@@ -64,7 +64,7 @@ def test_ranges_dropped_by_a_queue_are_reported(ros: Ros):
         # Send more than the queue can hold.
         for _ in range(300):
             publisher.publish(data)
-        return status.message == diagnostics.DROPPED.text
+        return status.message == mitigator_health.DROPPED.text
 
     status = ros.diagnosis("mitigator", excerpt)
     assert status.level == DiagnosticStatus.WARN
@@ -142,9 +142,9 @@ def warnings(health: MitigatorHealth) -> list[str]:
     ("statuses", "expected"),
     [
         ({Status.OK: 100}, []),
-        ({Status.OK: 79, Status.OUT_OF_DISTRIBUTION: 21}, [diagnostics.OUT_OF_DISTRIBUTION.text]),
+        ({Status.OK: 79, Status.OUT_OF_DISTRIBUTION: 21}, [mitigator_health.OUT_OF_DISTRIBUTION.text]),
         ({Status.OK: 89, Status.OUT_OF_DISTRIBUTION: 21}, []),
-        ({Status.OK: 79, Status.BAD_CIR: 11, Status.NO_CIR: 10}, [diagnostics.NO_USABLE_CIR.text]),
+        ({Status.OK: 79, Status.BAD_CIR: 11, Status.NO_CIR: 10}, [mitigator_health.NO_USABLE_CIR.text]),
         ({Status.OK: 89, Status.BAD_CIR: 11, Status.NO_CIR: 10}, []),
     ],
 )
@@ -153,38 +153,38 @@ def test_many_ranges_of_a_bad_status_cause_a_warning(statuses: dict[Status, int]
 
 
 def test_slow_correction_and_no_data_cause_a_warning():
-    assert warnings(health(processing_ms=25.0)) == [diagnostics.SLOW.text]
+    assert warnings(health(processing_ms=25.0)) == [mitigator_health.SLOW.text]
     now_s = [100.0]
     silent = health(now_s=lambda: now_s[0])
     now_s[0] = 106.0
-    assert warnings(silent) == [diagnostics.NO_RANGES.text]
+    assert warnings(silent) == [mitigator_health.NO_RANGES.text]
 
 
 def test_drop_causes_one_warning():
     dropping = health()
     dropping.lost += 3
-    assert warnings(dropping) == [diagnostics.DROPPED.text]
+    assert warnings(dropping) == [mitigator_health.DROPPED.text]
     assert warnings(dropping) == []
     assert dropping.dropped == 3
 
 
 def test_model_that_includes_an_offset_causes_a_warning_after_enough_ranges():
     health = MitigatorHealth()
-    health.los_m.extend([0.3] * (diagnostics.MIN_LOS - 1))
+    health.los_m.extend([0.3] * (mitigator_health.MIN_LOS - 1))
     health.excludes_offset = True
-    assert diagnostics.OFFSET.text not in warnings(health)
+    assert mitigator_health.OFFSET.text not in warnings(health)
     health.los_m.append(0.3)
-    assert diagnostics.OFFSET.text in warnings(health)
+    assert mitigator_health.OFFSET.text in warnings(health)
     health.excludes_offset = False
-    assert diagnostics.OFFSET.text not in warnings(health)
+    assert mitigator_health.OFFSET.text not in warnings(health)
     health.excludes_offset = True
     health.los_m.extend([-0.05] * 1000)
-    assert diagnostics.OFFSET.text not in warnings(health)
+    assert mitigator_health.OFFSET.text not in warnings(health)
     # An offset is in all ranges; the median alone can be that of a few NLOS ranges with a strong first path.
     health.los_m.extend([0.0] * 400 + [-0.3] * 600)
-    assert diagnostics.OFFSET.text not in warnings(health)
+    assert mitigator_health.OFFSET.text not in warnings(health)
     health.los_m.extend([-0.3] * 200)
-    assert diagnostics.OFFSET.text in warnings(health)
+    assert mitigator_health.OFFSET.text in warnings(health)
 
 
 @pytest.mark.parametrize("count", [2, 3, 5])
@@ -224,7 +224,7 @@ def test_restarted_publisher_counts_no_drops():
 
 def test_middleware_without_numbers_may_hide_drops():
     silent = health()
-    silent.loss_counter.add(diagnostics.NO_SEQUENCE_NUMBER)
+    silent.loss_counter.add(mitigator_health.NO_SEQUENCE_NUMBER)
     silent.lost += 7
     assert silent.period()[1]["dropped by a queue"] == "7 or more"
 

@@ -26,9 +26,9 @@ from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.mitigation.model.shipped import load_model
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD, Scaling
 from uwb_mitigation.nodes.support import diagnostics, endpoints
-from uwb_mitigation.nodes.support.diagnostics import MitigatorHealth
 from uwb_mitigation.nodes.support.endpoints import BATCH
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode, refuse_errors
+from uwb_mitigation.nodes.support.mitigator_health import ALL_REJECTED, MitigatorHealth
 from uwb_mitigation.nodes.support.sensor_ranges import SensorRanges
 from uwb_mitigation.types.measurement import (
     LINE_OF_SIGHT_DB,
@@ -180,7 +180,7 @@ class Mitigator(ManagedNode):
         level, text = diagnostics.OK, "correcting"
         if (mitigation := self._mitigation) is not None:
             bundles, rejected = mitigation.bundles, self.health.rejected
-            if diagnostics.ALL_REJECTED.text in warnings and len(bundles) == 1 and rejected is not None:
+            if ALL_REJECTED.text in warnings and len(bundles) == 1 and rejected is not None:
                 warnings.append(self._advice(bundles[0], CirKind.of(rejected)))
             entries |= {
                 "model": ", ".join(bundle.card.label for bundle in bundles),
