@@ -17,6 +17,9 @@ from uwb_mitigation.types.tracks import Ranges, Track
 
 UNIQUE, UNKNOWN, CONTRADICTED = Ambiguity.NONE.value, "unknown", "contradicted"
 
+TOO_SHORT_SHARE = 0.1
+"""See `drive_determination`. Shares with two swapped anchors: 0.6 to 0.9 (simulated)."""
+
 POOR_DOP = 10.0
 """A direction is weak if errors of ranges are multiplied by more."""
 
@@ -50,7 +53,7 @@ class Determination:
 
 _CONTRADICTED = Determination(
     CONTRADICTED,
-    "ranges of half of the anchors or more contradicted it twice",
+    "ranges of half of the anchors or more contradicted it twice, or many are too short for it",
     "unless obstacles blocked them, or the tag was carried: check ids, coordinates and units in the anchors file, and the height; "
     "`uwb-mitigation survey` finds swapped anchors",
 )
@@ -131,7 +134,8 @@ def current_determination(estimator: TagEstimator) -> Determination:
 def drive_determination(estimator: TagEstimator, ranges: Ranges, track: Track) -> Determination:
     """Return the statement for a drive: what held most often, at the position with the median HDOP.
 
-    It is contradicted if the tag was lost twice within `CONTRADICTED_S`, and on average once within twice this time.
+    It is contradicted if the tag was lost twice within `CONTRADICTED_S`, and on average once within twice this time, or if
+    for `TOO_SHORT_SHARE` of the ranges many were too short.
 
     Args:
         estimator: that processed the drive.
@@ -139,7 +143,9 @@ def drive_determination(estimator: TagEstimator, ranges: Ranges, track: Track) -
         track: positions of the drive; empty: the statement is that for the latest ranges.
     """
     duration_s = float(ranges.stamp_ns[-1] - ranges.stamp_ns[0]) / NS_PER_S
-    if estimator.counts["contradicted"] and 2.0 * CONTRADICTED_S * estimator.counts["lost"] >= duration_s:
+    counts = estimator.counts
+    is_often_lost = counts["contradicted"] and 2.0 * CONTRADICTED_S * counts["lost"] >= duration_s
+    if is_often_lost or counts["too short"] > TOO_SHORT_SHARE * len(ranges):
         return _CONTRADICTED
     ambiguities = estimator.images.counts.most_common(1)
     if not len(track) or not ambiguities:
