@@ -167,6 +167,7 @@ def test_verdict_has_the_sentences_of_the_viewer(
     is_good, text = monitor.sentence()
     assert re.fullmatch(f"Position of tag 7 {expected}", text), text
     assert is_good == expected.startswith("good")
+    assert (2 in changes) == bool(re.search(r"\b2 \+0\.[3-6]\d", monitor.residuals())), monitor.residuals()
     now_s[0] += 12.0
     lost = "Position of tag 7 lost: no ranges of tag 7 for 12 s. Check power of the tag, and the driver"
     assert monitor.sentence() == (False, lost)
@@ -211,6 +212,7 @@ def test_absent_mitigator_and_a_second_locator_are_reported(ros: Ros, anchors: P
     ros.diagnosis(
         "locator", lambda status: status.message.startswith("Position of tag 7 good: horizontal sd")
     )
+    locator.wait_for_output("Position of tag 7 good: horizontal sd")
     ros.node.create_publisher(PoseWithCovarianceStamped, "/uwb/pose", 10)
     ros.diagnosis("locator", lambda status: "another node publishes /uwb/pose" in status.message)
 

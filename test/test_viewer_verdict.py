@@ -132,7 +132,9 @@ def test_verdict_and_table_agree_on_a_common_offset(error_m: float, state: str):
     page = controls(driven(dict.fromkeys(ANCHORS, error_m))[0])
     reason = f"All anchors read too long, {error_m:.2f} m in the median"
     assert page.verdict[:2] == ["degraded", reason]
-    assert page.verdict[2].startswith("A common cause is likely. Calibrate the offset")
+    assert page.verdict[2].startswith(
+        "A common cause is likely. Check the height and the anchors file, or calibrate"
+    )
     assert page.health[0][0] == state
     assert page.health[0][-1].startswith(reason)
 

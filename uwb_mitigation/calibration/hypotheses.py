@@ -90,7 +90,7 @@ _MAX_ANCHOR_RANGES, _SIMPLEX_M = 1000, 0.5
 _LINEARISATIONS = 2
 """Fits of a displacement together with the track: the directions of the ranges change little with it."""
 
-_REMEDY = "their true positions in the anchors file (`uwb-mitigation survey` finds them)"
+_REMEDY = "the true positions in the anchors file; `uwb-mitigation survey` finds them"
 
 
 class AnchorHypotheses:

@@ -65,7 +65,7 @@ if TYPE_CHECKING:
     from uwb_mitigation.recordings.mapping.mapping import Mapping
 
 LOG_AFTER_S = 5.0
-"""Warnings are in the diagnostics, and in the log this time after the activation: other nodes may start later."""
+"""Warnings are in the diagnostics at once, and in the log if they last: other nodes may start later, and a search begins with some."""
 
 PERIOD_S = 0.2
 """Period of smoothed poses, of markers, and of predictions without ranges."""
@@ -121,7 +121,7 @@ class Locator(ManagedNode):
         self._outputs: dict[int, _Outputs] = {}
         self._robot: OdometryInput | None = None
         self._lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
-        self._ranges_topic, self._opened_s = "", math.inf
+        self._ranges_topic, self._good_s, self._has_warned = "", math.inf, False
         self._malformed = self._lost = 0
         self._unknown_anchors: set[int] = set()
         self._processing_ns: list[int] = []
@@ -184,7 +184,7 @@ class Locator(ManagedNode):
         self.steady_timer(PERIOD_S, self._on_timer)
 
     def begin(self) -> None:
-        self._opened_s = time.monotonic()
+        self._good_s = time.monotonic()
         self._show_anchors()
         self.get_logger().info("locating")
 
@@ -215,12 +215,11 @@ class Locator(ManagedNode):
                 )
         if not estimator.tags and self._ranges_topic and not self.count_publishers(self._ranges_topic):
             warnings.append(f"no ranges: {self._ranges_topic} has no publisher. Start driver and mitigator")
-        if warnings and time.monotonic() - self._opened_s > LOG_AFTER_S:
-            self.get_logger().warning("; ".join(warnings[:5]), throttle_duration_sec=60.0)
+        good = "; ".join(text for _, text in list(sentences.values())[:5])
+        self._log(warnings, good)
         if self._robot is not None and (warning := self._robot.warning()):
             warnings.insert(0, warning)
             self.get_logger().warning(warning, throttle_duration_sec=60.0)
-        good = "; ".join(text for _, text in list(sentences.values())[:5])
         level, text = diagnostics.OK, good or "no ranges yet"
         if warnings:
             level, text = diagnostics.WARN, "; ".join(warnings[:5])
@@ -230,10 +229,22 @@ class Locator(ManagedNode):
                 f"{m:.3f}" for m in self._lever_arm_of(outputs)
             )
             values[f"{outputs.monitor.name} position"] = sentences[outputs.monitor.name][1]
+            if outputs.monitor.age_s <= STALE_S:
+                values[f"{outputs.monitor.name} mean residuals m"] = outputs.monitor.residuals()
         values |= self._meter.entries()
         durations_ns, self._processing_ns = self._processing_ns, []
         values |= diagnostics.percentiles("processing", durations_ns)
         return "host", level, text, values
+
+    def _log(self, warnings: list[str], good: str) -> None:
+        """Log warnings that last, and their end: each search of a position begins with some."""
+        if not warnings:
+            if self._has_warned and good:
+                self.get_logger().info(good)
+            self._good_s, self._has_warned = time.monotonic(), False
+        elif time.monotonic() - self._good_s > LOG_AFTER_S:
+            self._has_warned = True
+            self.get_logger().warning("; ".join(warnings[:5]), throttle_duration_sec=60.0)
 
     def _subscribe_to_ranges(self, source: str) -> float:
         """Subscribe to the topics of a mapping or to a topic; return the standard deviation in the mapping, m, 0: unknown."""

@@ -38,7 +38,7 @@ the estimated position (m); `evidence`, number of residuals; `stopped`, age of t
 
 
 FAULTS = (
-    ("stopped", 0.0, BAD, "has not answered for {stopped:.0f} s: check its power and PAN id."),
+    ("stopped", 0.0, BAD, "has not answered for {stopped:.0f} s: it is blocked or too far away, or check its power and PAN id."),
     ("displaced", 0.0, BAD, "is not where the anchors file says: its ranges fit x = {fit_x:.2f}, y = {fit_y:.2f} m, "
                             "{moved:.1f} m away. Measure it again, or run `uwb-mitigation survey`."),
     # Without line of sight, ranges may be long although anchor and offset are right.
@@ -103,8 +103,8 @@ def _common_advice(anchors: list[Means]) -> str:
         return "The ranges of all anchors contradict the position: check ids and coordinates in the anchors file, and the height."
     size_m, direction = abs(float(np.median(residuals_m))), "long" if residuals_m[0] > 0.0 else "short"
     return (
-        f"All anchors read too {direction}, {size_m:.2f} m in the median: a common cause is likely. Calibrate the offset "
-        "(antenna delay), or check the anchors file and the height."
+        f"All anchors read too {direction}, {size_m:.2f} m in the median: a common cause is likely. Check the height "
+        "and the anchors file, or calibrate the offset (antenna delay)."
     )
 
 

@@ -82,6 +82,10 @@ class PositionMonitor:
         detail = f": {verdict.accuracy}" if is_good else action
         return is_good, verdict.headline(f" of {self.name}") + detail
 
+    def residuals(self) -> str:
+        """Return each anchor with the mean of range minus distance to the position, m."""
+        return ", ".join(f"{format_id(key)} {means['residual']:+.2f}" for key, means in self._means().items())
+
     def _means(self) -> dict[int, Means]:
         """Return the means of each anchor that was received in the last minute, as the viewer has them of its pairs."""
         result, now_s = dict[int, Means](), self._now_s()
