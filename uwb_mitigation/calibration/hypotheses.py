@@ -51,7 +51,7 @@ class HypothesisLimits:
         misfit_m, misfit_share: swaps are examined if this share of the ranges has larger residuals.
         max_misfit_share: if a larger share has such residuals, the track is wrong. Simulated: at most 0.11 of the ranges of
             drives and placements, 0.67 or more of those of placements that are recorded as one drive.
-        suspects: number of anchors with the largest misfit that are tried in pairs: all pairs of 24 would take minutes.
+        suspects: number of anchors with the largest misfit that are tried, in pairs and displaced: all of 24 would take minutes.
         trial_ranges: number of ranges with which a pair is tried; `mean_gain`: minimum gain of a range, in addition to
             `swap_share`.
         no_position_loss: loss of a range without a position: that of a large outlier.
@@ -314,8 +314,10 @@ def displacement_note(fit: JointFit) -> str:
     Unlike in `AnchorHypotheses`, tracks and offsets are fitted again with each displacement, so that few anchors suffice: a
     track that follows a displaced anchor hides it from the others. Walls can look the same.
     """
-    fits = {}
-    for row in np.unique(fit.observations.anchor).tolist():
+    fits, observations = {}, fit.observations
+    loss = fit.config.model.loss(fit.residual_m / fit.scale_m[observations.noise_group])
+    suspects = np.argsort(np.bincount(observations.anchor, loss * observations.independent))[::-1]
+    for row in np.intersect1d(suspects[: LIMITS.suspects], observations.anchor).tolist():
         with contextlib.suppress(DatasetError):
             fits[row] = _displaced(fit, row)
     moved = {
@@ -326,7 +328,9 @@ def displacement_note(fit: JointFit) -> str:
     row = max(moved, key=moved.__getitem__, default=None)
     if row is not None and moved[row] > LIMITS.gain:
         anchor = fit.config.anchors.anchors[row]
-        return f"anchor {anchor} may be displaced: {fit_text(anchor, fits[row][0])}. Walls can look the same: measure it again"
+        return f"anchor {anchor} may be displaced: {fit_text(anchor, fits[row][0])}. Walls or a wrong height can look the same: check the height, then measure it again"
+    if not fits:
+        return ""
     anchor, _ = max(fits.values(), key=lambda of_anchor: of_anchor[0].sd)
     if 2.0 * anchor.sd > LIMITS.unnoticed_m:
         return (

@@ -176,7 +176,7 @@ def survey(
     save_anchors(
         output, result.anchors, f"surveyed from {bag.name}, tag {format_id(tag.tag_id)}", force=force
     )
-    _show_survey(result, has_fixed=bool(rows))
+    _show_survey(result, has_fixed=len(rows) > 1)
     print_line(f"Wrote {len(index)} anchors to {output}.")
     console.write_json(json, {"output": output}, result)
 

@@ -17,8 +17,8 @@ from uwb_mitigation.types.tracks import Ranges, Track
 
 UNIQUE, UNKNOWN, CONTRADICTED = Ambiguity.NONE.value, "unknown", "contradicted"
 
-TOO_SHORT_SHARE = 0.1
-"""See `drive_determination`. Shares with two swapped anchors: 0.6 to 0.9 (simulated)."""
+TOO_SHORT_SHARE = 0.03
+"""See `drive_determination`. Shares with two swapped anchors: 0.04 to 0.47 where there are any (simulated); with right ones: 0."""
 
 POOR_DOP = 10.0
 """A direction is weak if errors of ranges are multiplied by more."""
@@ -53,7 +53,7 @@ class Determination:
 
 _CONTRADICTED = Determination(
     CONTRADICTED,
-    "ranges of half of the anchors or more contradicted it twice, or many are too short for it",
+    "ranges of half of the anchors or more contradicted it twice, or those of two anchors are too short for it",
     "unless obstacles blocked them, or the tag was carried: check ids, coordinates and units in the anchors file, and the height; "
     "`uwb-mitigation survey` finds swapped anchors",
 )
@@ -135,7 +135,7 @@ def drive_determination(estimator: TagEstimator, ranges: Ranges, track: Track) -
     """Return the statement for a drive: what held most often, at the position with the median HDOP.
 
     It is contradicted if the tag was lost twice within `CONTRADICTED_S`, and on average once within twice this time, or if
-    for `TOO_SHORT_SHARE` of the ranges many were too short.
+    for `TOO_SHORT_SHARE` of the ranges those of two anchors were too short.
 
     Args:
         estimator: that processed the drive.

@@ -10,8 +10,8 @@ import numpy as np
 
 from uwb_mitigation.errors import format_id
 
-NO_DATA_S = 3.0
-"""A tag or a pair has no data after this time."""
+NO_DATA_S, NO_DATA_INTERVALS = 3.0, 3.0
+"""A tag or a pair has no data after this time, or after this number of its mean intervals if that is longer."""
 LONG_M, VERY_LONG_M = 0.15, 0.3
 """Mean residuals that need attention, and that spoil positions."""
 MAX_LOST, MAX_NLOS, MAX_NOT_OK = 20.0, 50.0, 20.0
@@ -108,6 +108,12 @@ def _common_advice(anchors: list[Means]) -> str:
     )
 
 
+def _is_wrong(means: Means) -> bool:
+    """Return whether an anchor reads wrong with line of sight."""
+    has_evidence = means["evidence"] >= EVIDENCE and means["nlos"] <= MAX_NLOS and means["stopped"] == 0.0
+    return has_evidence and abs(means["residual"]) > LONG_M
+
+
 def degradation(
     anchors: Mapping[int, Means], states: Mapping[int, str], names: Mapping[int, str], sd_m: float
 ) -> tuple[str, str]:
@@ -126,7 +132,11 @@ def degradation(
     if bad := [key for key in anchors if states[key] in wrong and (common or texts[key])]:
         worst = max(bad, key=lambda key: [abs(anchors[key][n]) for n in ("stopped", "displaced", "residual")])
         reason, _, action = (common or texts[worst]).partition(": ")
-        if not common and sum(abs(means["residual"]) > LONG_M for means in anchors.values()) > 1:
+        if (
+            not common
+            and sum(_is_wrong(means) for means in anchors.values()) > 1
+            and _is_wrong(anchors[worst])
+        ):
             action += " Several anchors read wrong: check height and lever arm of the tag, too."
         return reason, action
     received = sum(means["stopped"] == 0.0 for means in anchors.values())

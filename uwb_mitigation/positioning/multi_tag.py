@@ -120,7 +120,7 @@ class FixedLagSmoother:
             live.predict(live.time_s + after_s)
             predicted = live.estimate(query_ns)
             moved, velocity, covariance = predicted.position, predicted.velocity, predicted.covariance
-        batch.covariance[:] += live.unseen
+        batch.covariance[:] = live.factor * batch.covariance + live.unseen
         mean = np.concatenate([moved, velocity])
         state, covariance, spread = fused_with_batch(mean[None], covariance[None], batch)
         position = state[0, :3] if config.area is None else config.area.clip(state[0, :3])

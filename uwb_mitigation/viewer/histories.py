@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.positioning.health import NO_DATA_S
+from uwb_mitigation.positioning.health import NO_DATA_INTERVALS, NO_DATA_S
 from uwb_mitigation.types.measurement import FAULTS, LINE_OF_SIGHT_DB, Cir, Encoding, Status
 
 MAX_SAMPLES = 6000
@@ -23,9 +23,6 @@ MAX_RANGE_M = 10_000.0
 """A longer range is shown in the table only; a larger error is not counted."""
 HISTORY_S = 60.0
 """Length of the strip chart of a pair."""
-NO_DATA_INTERVALS = 3.0
-"""A pair or a tag has no data after `NO_DATA_S`, or after this number of its mean intervals if that is longer; without the time
-in which the viewer itself drops ranges."""
 STATISTICS, RATE_RANGES = 100, 20
 """Numbers of latest ranges in the statistics of a pair and in its rate."""
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import format_id
-from uwb_mitigation.positioning.health import NO_DATA_S
-from uwb_mitigation.viewer.histories import NO_DATA_INTERVALS, BoundedDict, Pair
+from uwb_mitigation.positioning.health import NO_DATA_INTERVALS, NO_DATA_S
+from uwb_mitigation.viewer.histories import BoundedDict, Pair
 
 MAX_EVENTS, MAX_SOURCES = 500, 1000
 CHECK_S = 0.5

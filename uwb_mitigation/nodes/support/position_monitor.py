@@ -12,10 +12,10 @@ import numpy as np
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.positioning import health
 from uwb_mitigation.positioning.determination import current_determination
-from uwb_mitigation.positioning.health import LONG_M, NO_DATA_S, Means, Verdict
+from uwb_mitigation.positioning.health import LONG_M, NO_DATA_INTERVALS, NO_DATA_S, Means, Verdict
 from uwb_mitigation.positioning.multi_tag import TagState
 from uwb_mitigation.types.anchors import Anchor
-from uwb_mitigation.types.measurement import CorrectedRange
+from uwb_mitigation.types.measurement import CorrectedRange, Status
 from uwb_mitigation.types.tracks import Estimate
 
 MAX_RANGES, RECENT_S = 50, 60.0
@@ -52,7 +52,10 @@ class PositionMonitor:
         if estimate is not None:
             residual_m = corrected.range_m - math.dist(estimate.position.tolist(), anchor.position)
         # The power gap of the CIR, with which the viewer recognises NLOS, is not in corrected ranges.
-        is_uncertain = corrected.status.is_corrected and corrected.variance_m2 > LONG_M**2
+        status = corrected.status
+        is_uncertain = status is Status.OUT_OF_DISTRIBUTION or (
+            status.is_corrected and corrected.variance_m2 > LONG_M**2
+        )
         self._residuals[anchor].append((self._received_s, residual_m, is_uncertain))
 
     def verdict(self) -> Verdict:
@@ -92,11 +95,12 @@ class PositionMonitor:
         for anchor, rows in self._residuals.items():
             received_s, residual_m, is_uncertain = np.array(rows).T
             age_s, known_m = now_s - float(received_s[-1]), residual_m[np.isfinite(residual_m)]
+            interval_s = float(received_s[-1] - received_s[0]) / max(len(received_s) - 1, 1)
             if age_s < RECENT_S:
                 result[anchor.id] = dict.fromkeys(("rate", "lost", "not_ok", "displaced"), 0.0) | {
                     "residual": float(known_m.mean()) if len(known_m) else math.nan,
                     "evidence": float(len(known_m)),
                     "nlos": 100.0 * float(is_uncertain.mean()),
-                    "stopped": age_s if age_s > NO_DATA_S else 0.0,
+                    "stopped": age_s if age_s > max(NO_DATA_S, NO_DATA_INTERVALS * interval_s) else 0.0,
                 }
         return result

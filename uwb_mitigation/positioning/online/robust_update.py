@@ -158,7 +158,7 @@ class RobustUpdate:
             size = min(MAX_CONSTANT, len(self._error_variance))
             H, columns = self.H, np.pad(self.moments, ((0, 0), (0, size)))
             self._set_moments(np.insert(columns, [len(H)] * size, 0.0, axis=0))
-            self.H[: len(H)] = H
+            self.H[: self._offset] = H[: self._offset]
         x, P = self.x, self.P
         free = self._offset + 1 + len(self._error_variance) + len(rows)
         row = free if free < len(x) else rows.pop(next(iter(rows)))

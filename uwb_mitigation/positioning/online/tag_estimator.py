@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.geometry import Dop, Height, dop
 from uwb_mitigation.positioning.online.ambiguity import SAME_M, AmbiguityCheck
-from uwb_mitigation.positioning.online.filter import KinematicState, RangeFilter
+from uwb_mitigation.positioning.online.filter import CONTRADICTED_FACTOR, KinematicState, RangeFilter
 from uwb_mitigation.positioning.online.initialization import (
     IMPLAUSIBLE,
     CandidatePosition,
@@ -40,13 +40,9 @@ CONTRADICTED_S = 60.0
 """Two losses within this time happen in none of the 40 drives of `benchmarks positions` in layouts whose anchors are not on a line."""
 
 TOO_SHORT = 10.0
-"""Ranges contradict a position if the mean square of their negative normalised innovations is larger: obstacles do not make ranges
-shorter. Largest values with right anchors: 6.5 (Hanyang), 2.1 (44 simulated drives past the layouts of real deployments); with two swapped
-anchors, 18 or more in 13 of 15 drives past five anchors or more."""
-
-CONTRADICTED_SCALE = 12.0
-"""Factor of published covariances meanwhile. With it, the 95 % ellipses of raw ranges past four anchors, two of them swapped or one
-3 m off, contain 35 to 91 % of the true positions instead of 16 to 52 % (simulated, six of ten drives)."""
+"""Ranges contradict a position if the mean squares of the negative normalised innovations of two anchors are larger: obstacles do not
+make ranges shorter, and one such anchor alone does not spoil the position. Largest
+values with right anchors: 6.0 (six Hanyang runs), 2.1 (30 simulated drives); with two of five swapped, 24 or more for seven of ten pairs."""
 
 OBSTACLE_S = 1.5
 """If the ranges of exactly half of the anchors are too long, obstacles are the reason unless it lasts longer. Chosen in drives behind
@@ -80,13 +76,15 @@ class _AnchorState:
     Attributes:
         received_s: time of the latest; -inf: none.
         outliers: share of the latest ranges (about twenty) that contradicted the filter; short: share of those that were too short.
-        mean_z: running mean of the normalised innovation over about fifty ranges, each limited to 5.
+        mean_z: running mean of the normalised innovation over about fifty ranges, each limited to 5. short_square: the same of
+            the square of negative ones, each limited to 10.
     """
 
     received_s: float = -math.inf
     outliers: float = 0.0
     short: float = 0.0
     mean_z: float = 0.0
+    short_square: float = 0.0
 
 
 @dataclass(slots=True)
@@ -104,7 +102,7 @@ class TagEstimator:
             within `CONTRADICTED_S` (`contradicted`), and without ranges (`silent`); of ranges that contradicted it as
             `TOO_SHORT` says (`too short`).
         innovation_mean, innovation_square: running means over about a hundred ranges: of the normalised innovation, and of
-            its square (1 is ideal). short_square: the same of the square of negative ones.
+            its square (1 is ideal).
         filter: the filter that follows the tag; None: its position is searched.
         images: other positions that explain the ranges; checked four times per second.
         undetermined: the ranges do not determine the horizontal position at all.
@@ -118,7 +116,7 @@ class TagEstimator:
     def __init__(self, config: EstimatorConfig) -> None:
         self.anchors = config.anchors
         self.counts: Counter[str] = Counter()
-        self.innovation_mean, self.innovation_square, self.short_square = 0.0, 1.0, 0.0
+        self.innovation_mean, self.innovation_square = 0.0, 1.0
         self.config, self._model = config, config.model
         self.images = AmbiguityCheck(config)
         self._height, self._area = config.height, config.area
@@ -130,10 +128,9 @@ class TagEstimator:
 
     @property
     def is_contradicted(self) -> bool:
-        """Whether many ranges are too short, or those of at least half of the anchors contradicted it twice within `CONTRADICTED_S`."""
-        return self.short_square > TOO_SHORT or (
-            len(self._losses_s) == 2 and self._time_s < self._losses_s[0] + CONTRADICTED_S
-        )
+        """Whether ranges of two anchors are too short, or those of half of the anchors contradicted it twice within `CONTRADICTED_S`."""
+        is_often_lost = len(self._losses_s) == 2 and self._time_s < self._losses_s[0] + CONTRADICTED_S
+        return self._is_short or is_often_lost
 
     @property
     def is_ambiguous(self) -> bool:
@@ -221,9 +218,9 @@ class TagEstimator:
         self._heights.clear()
         self._recent.clear()
         self._losses_s.clear()
-        self.short_square = 0.0
+        self._is_short = False
         for state in self._states:
-            state.received_s = -math.inf
+            state.received_s, state.short_square = -math.inf, 0.0
         self._restart_search(-math.inf)
 
     def received_anchors(self, within_s: float = WINDOW_S) -> list[int]:
@@ -277,9 +274,10 @@ class TagEstimator:
         limited = z if -10.0 < z < 10.0 else math.copysign(10.0, z)
         self.innovation_mean += 0.01 * (limited - self.innovation_mean)
         self.innovation_square += 0.01 * (limited * limited - self.innovation_square)
-        self.short_square += 0.01 * (min(limited, 0.0) ** 2 - self.short_square)
-        self.counts["too short"] += self.short_square > TOO_SHORT
+        self.counts["too short"] += self._is_short
+        short = limited if limited < 0.0 else 0.0
         state = self._states[measurement.anchor]
+        state.short_square += 0.02 * (short * short - state.short_square)
         state.outliers += 0.1 * ((abs(z) > OUTLIER) - state.outliers)
         state.short += 0.1 * ((z < -OUTLIER) - state.short)
         limited = z if -5.0 < z < 5.0 else math.copysign(5.0, z)
@@ -287,6 +285,8 @@ class TagEstimator:
         if self._time_s >= self._next_check_s:
             self._next_check_s = self._time_s + _RETRY_S
             received, was_ambiguous = self.received_anchors(), self.is_ambiguous
+            self._is_short = sum(self._states[row].short_square > TOO_SHORT for row in received) > 1
+            filter_.factor = CONTRADICTED_FACTOR if self.is_contradicted else 1.0
             if self._detect_loss(received):
                 self.counts["lost"] += 1
                 self._losses_s.append(self._time_s)
@@ -316,8 +316,6 @@ class TagEstimator:
         position, velocity, covariance = filter_.solution()
         if self.images.mirror is not None:
             position += self.images.shift
-        if self.is_contradicted:
-            covariance *= CONTRADICTED_SCALE
         if self._height is not None:
             # Constant errors of ranges would move it in the filter.
             position[2] = self._height.value
