@@ -64,7 +64,7 @@ def nodes_of(pid: int) -> list[psutil.Process]:
 
 @pytest.mark.parametrize(
     ("program", "number", "code"),
-    [("nodes", signal.SIGKILL, -9), ("demo", signal.SIGINT, 130)],
+    [("nodes", signal.SIGKILL, -9), ("demo", signal.SIGTERM, 143), ("demo", signal.SIGINT, 130)],
 )
 def test_nodes_end_with_their_parent_process(program: str, number: signal.Signals, code: int, tmp_path: Path):
     # Each process isolates itself.

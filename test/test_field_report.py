@@ -208,7 +208,9 @@ RANGE = RangeMeasurement(0, 1, 2, 0, 0, 3.0, Cir(np.tile(np.int16([3, -3]), 20),
     ],
 )
 def test_a_check_fails(change: dict, name: str):
-    good = Observation(3.0, 1.0, (1, 2), ranges=[replace(RANGE, stamp_ns=number) for number in range(100)])
+    good = Observation(
+        3.0, 1.0, (1, 2), voltage=3.3, ranges=[replace(RANGE, stamp_ns=number) for number in range(100)]
+    )
     before = {check.name: check.verdict for check in run_checks(good)}
     assert before.get(name) in (None, Verdict.PASS)
     after = {check.name: check.verdict for check in run_checks(replace(good, **change))}

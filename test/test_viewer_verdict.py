@@ -290,7 +290,7 @@ def test_map_has_heading_ellipse_and_a_legend_of_what_it_contains():
 
     def legend() -> set[str]:
         legends = page.document.get_model_by_name("map").legend
-        items = [item for legend in legends for item in legend.items if item.visible]
+        items = [item for legend in legends if legend.visible for item in legend.items if item.visible]
         fields = {item.label.field for item in items if hasattr(item.label, "field")}
         return {value for field in fields for value in page.column("map", field)} | {
             item.label.value for item in items if hasattr(item.label, "value")
@@ -352,12 +352,24 @@ def test_clock_jump_dead_tag_and_old_stamps_are_reported():
             scene.add_sample((anchor, 7), Sample(clock.now_s + 4500.0, 5.0, 5.0, 0.1, Status.OK))
     page = controls(scene)
     assert page.incidents == [(None, "0 s ago: clock of tag 7: jump by +3600 s")]
-    assert "last range -3600.0 s old by stamp" in page.verdict[3]
+    assert [(row[0], row[-1]) for row in page.tag_rows] == [("tag 7", "-3600.0 s"), ("tag 9", "11.9 s")]
     clock.now_s += 5.0
     scene.add_sample((1, 7), Sample(clock.now_s + 4500.0, 5.0, 5.0, 0.1, Status.OK))
     page = controls(scene)
     assert (None, "5 s ago: tag 9: lost") in page.incidents
-    assert page.tag_rows[1][4:] == ["no position", "0.0"]
+    assert page.tag_rows[1][4:] == ["no position", "0.0", "16.9 s"]
+
+
+def test_pause_of_a_bag_does_not_hide_why_there_is_no_position():
+    scene, clock = driven(senders=[1, 2])
+    scene.tags.clear()
+    # The stamps continue where the bag was paused.
+    begin_s, clock.now_s = clock.now_s + 900.0, clock.now_s + 30.0
+    for tenth in range(1, 31):
+        clock.now_s += 0.1
+        for anchor in (1, 2):
+            scene.add_sample((anchor, 7), Sample(begin_s + tenth / 10, 5.0, 5.0, 0.1, Status.OK))
+    assert controls(scene).verdict[1] == "only anchors 1 and 2 send ranges; no ranges from 3, 4"
 
 
 @pytest.mark.parametrize(("has_position", "state"), [(True, "lost"), (False, "not determined")])

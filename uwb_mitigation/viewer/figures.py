@@ -388,7 +388,8 @@ class Map:
 
     def _draw_anchors(self, scene: Scene) -> None:
         page, displaced, rows = self._page, self._page.view.timeline.displaced, []
-        selected = page.selected and page.selected[0]
+        # A report has no selection.
+        selected = page.selected[0] if page.selected and math.isfinite(page.trail_s) else None
         # The selected one first: its name has priority.
         for identity in sorted(scene.anchors, key=lambda identity: identity != selected):
             anchor = scene.anchors[identity]

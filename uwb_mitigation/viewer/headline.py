@@ -19,8 +19,6 @@ from uwb_mitigation.viewer.state import View
 
 WHOLE, RECENT, LIVE = "whole recording", f"last {HISTORY_S:.0f} s", "since the start"
 """Names of the intervals."""
-NAMES = {TrackKind.RAW: "raw + same filter", TrackKind.SMOOTHED: TrackKind.SMOOTHED.value}
-"""Names of the tracks that are compared with the corrected one."""
 
 Card = list[str]
 """Title, value and explanation of a figure."""
@@ -119,19 +117,31 @@ class Positions:
         if self.track(TrackKind.TRUE) is None:
             median_m = _metres(track[track[:, 0] > begin_s, 4], np.median)
             return [[f"Reported standard deviation, {window}", median_m, "median; no true positions"]]
-        errors = {kind: self.errors(kind, begin_s) for kind in NAMES if self.track(kind) is not None}
+        errors = {
+            kind: self.errors(kind, begin_s)
+            for kind in (TrackKind.RAW, TrackKind.SMOOTHED)
+            if self.track(kind) is not None
+        }
         corrected, shown = self.errors(TrackKind.CORRECTED, begin_s), []
         for title, name in (("Position RMSE", "rmse"), ("95 % of position errors below", "p95")):
-            others = (f"{NAMES[kind]}: {_metres(getattr(error, name))}" for kind, error in errors.items())
+            others = (
+                f"{self._title(kind)}: {_metres(getattr(error, name))}" for kind, error in errors.items()
+            )
             shown.append([f"{title}, {window}", _metres(getattr(corrected, name)), "; ".join(others)])
         raw_m = errors.get(TrackKind.RAW, NO_ERRORS).rmse
         # Without corrections, offsets make the difference.
         if self._is_corrected and corrected.rmse + raw_m > 0.0:
             percent = 100.0 * (corrected.rmse / raw_m - 1.0)
             change = f"{abs(percent):.0f} % {'more' if percent > 0.0 else 'less'} error"
-            text = f"position RMSE {corrected.rmse:.3f} m; {NAMES[TrackKind.RAW]}: {raw_m:.3f} m"
+            text = f"position RMSE {corrected.rmse:.3f} m; {self._title(TrackKind.RAW)}: {raw_m:.3f} m"
             shown.append([f"Correction, {window}", change if abs(percent) >= 0.5 else "no change", text])
         return shown
+
+    def _title(self, kind: TrackKind) -> str:
+        """Return the name of a track that is compared with the corrected one; recorded poses may have other settings."""
+        if kind is not TrackKind.RAW:
+            return str(kind.value)
+        return "raw + default filter" if self._estimated is None else "raw + same filter"
 
 
 def _track(columns: NDArray[np.float64]) -> Track:

@@ -120,6 +120,7 @@ class BagPlayer:
                 self.models = {} if backend is None else backend.used
                 if config is not None:
                     timeline.estimate(config, stamp_offset_s, estimated)
+                timeline.forget_ranges()
                 timeline.is_complete = True
                 self._show()
                 if check is not None and config is not None and timeline.estimates:

@@ -196,6 +196,10 @@ class Recording(Timeline):
             columns.true_m[:], columns.gap_db[:], columns.rx_dbm[:] = true_m[rows], gap_db[rows], rx_dbm[rows]
         self.scene.count_errors(np.stack([ranges["raw_m"], ranges["range_m"]]) - true_m)
 
+    def forget_ranges(self) -> None:
+        """Free the tables of ranges, which only `estimate` needs."""
+        self._table = RangeTable()
+
     def estimate(
         self, config: EstimatorConfig, stamp_offset_s: float = 0.0, estimated: Sequence[TagTracks] = ()
     ) -> None:

@@ -40,7 +40,7 @@ COLUMNS = {
 """Columns of the table of pairs after anchor and tag: {field: (title, interval, description)}."""
 
 ANCHOR_TITLES = "state", "anchor", "rate, Hz", "NLOS, %", "residual, m", "lost, %", "advice"
-TAG_TITLES = "tag", "position", "x, y, z, m", "sd, m", "age", "ranges, Hz"
+TAG_TITLES = "tag", "position", "x, y, z, m", "sd, m", "age", "ranges, Hz", "range age by stamp"
 """Columns of the tables of anchors and of tags."""
 MAX_SHOWN_EVENTS = 8
 
@@ -195,13 +195,14 @@ def _tag_rows(scene: Scene, pairs: dict[Pair, Means], verdicts: dict[int | None,
         place, sd_m, age = f"{pose.x:.2f}, {pose.y:.2f}, {pose.z:.2f}", pose.sd_m, f"{age_s:.1f} s"
         if age_s > NO_DATA_S:
             place, sd_m, age = f"last: {place}", math.nan, f"no data for {age_s:.0f} s"
-        rows[label] = [label, "-", place, _number(sd_m, 2), age, "-"]
+        rows[label] = [label, "-", place, _number(sd_m, 2), age, "-", "-"]
     for tag_id in sorted({tag_id for _, tag_id in pairs}):
         label, name = f"tag {format_id(tag_id)}", tag_name(tag_id, scene.tags, pairs)
         label = tag_label(name, plain_id) if name else label
-        row = rows.setdefault(label, [label, "", "-", "-", "no position", ""])
+        row = rows.setdefault(label, [label, "", "-", "-", "no position", "", ""])
         rate_hz = sum(np.nan_to_num(means["rate"]) for (_, tag), means in pairs.items() if tag == tag_id)
-        row[1], row[5] = verdicts[tag_id].state, _number(rate_hz, 1)
+        row[1] = verdicts[tag_id].state
+        row[5:] = _number(rate_hz, 1), f"{scene.stamp_clock() - scene.latest_stamp_s(tag_id):.1f} s"
     return list(rows.values())
 
 

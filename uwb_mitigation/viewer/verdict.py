@@ -111,12 +111,14 @@ def verdict(
     # The last positions before a jump may arrive after it.
     is_lost = pose is not None and scene.age_s(pose) > NO_DATA_S
     begin_s = scene.clock() - JUMP_S if pose is None else pose.received_s - NO_DATA_S
-    if (pose is None or is_lost) and jump_at_s > begin_s:
+    silent = sorted(set(scene.anchors).difference(received))
+    # A paused bag is a jump, too: without a position before it, other reasons are more likely.
+    is_explained = bool(reason or (silent and 0 < len(received) <= MIN_ANCHORS))
+    if (is_lost or (pose is None and not is_explained)) and jump_at_s > begin_s:
         reason = f"the clock of {name} jumped by {jump_s:+.0f} s"
         return Verdict(LOST if is_lost else UNDETERMINED, reason, SYNCHRONISE)
     if pose is None:
         action = action or "see the notices below"
-        silent = sorted(set(scene.anchors).difference(received))
         if silent and 0 < len(received) <= MIN_ANCHORS:
             senders, missing = " and ".join(map(format_id, received)), ", ".join(map(format_id, silent[:6]))
             senders = f"anchors {senders} send" if len(received) > 1 else f"anchor {senders} sends"
