@@ -87,7 +87,7 @@ def terminals(tmp_path: Path, ros: Ros, monkeypatch: pytest.MonkeyPatch) -> Iter
     monkeypatch.setenv("PATH", str(tools), prepend=os.pathsep)
     monkeypatch.setenv("PYTHONPATH", str(REPOSITORY), prepend=os.pathsep)
     monkeypatch.setenv("COLUMNS", "160")
-    monkeypatch.setenv("RECORDED_RANGES", "look 20 first 200 second 50 los 20")
+    monkeypatch.setenv("RECORDED_RANGES", "look 20 first 320 second 50 los 30")
     monkeypatch.chdir(folder)
     opened = Terminals(ros)
     yield opened
