@@ -205,7 +205,7 @@ class Locator(ManagedNode):
         )
         values = {key: value for key, value in estimator.diagnostics().items() if not key.startswith(stale)}
         bad = {name: text for name, (is_good, text) in sentences.items() if not is_good}
-        warnings = [text for name, text in bad.items() if f"{name}: " not in stale]
+        warnings = [text for name, text in bad.items() if f"{name}:" not in stale]
         # The sentences contain the statements on ambiguous positions.
         said = {f"{name}: {values.get(f'{name} determination')}" for name in sentences}
         warnings += [text for text in estimator.warnings() if not text.startswith(stale) and text not in said]
@@ -217,7 +217,7 @@ class Locator(ManagedNode):
         if not estimator.tags and self._ranges_topic and not self.count_publishers(self._ranges_topic):
             warnings.append(f"no ranges: {self._ranges_topic} has no publisher. Start driver and mitigator")
         # Tags that are gone must not hide other warnings.
-        warnings += [text for name, text in bad.items() if f"{name}: " in stale]
+        warnings += [text for name, text in bad.items() if f"{name}:" in stale]
         good = "; ".join(text for _, text in list(sentences.values())[:5])
         self._log(warnings, good)
         if self._robot is not None and (warning := self._robot.warning()):
