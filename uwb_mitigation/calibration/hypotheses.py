@@ -284,14 +284,11 @@ def check_anchors(segments: Segments, fit: JointFit, antenna: NDArray[np.float64
     Raises:
         DatasetError: names the anchors; or most ranges contradict the track.
     """
-    observations, independent = fit.observations, fit.observations.independent
+    independent = fit.observations.independent
     is_misfit = np.abs(fit.residual_m) > LIMITS.misfit_m
     ratio_of_misfits = float((independent * is_misfit).sum() / independent.sum())
     if ratio_of_misfits > LIMITS.misfit_share:
-        loss = fit.config.model.loss(fit.residual_m / fit.scale_m[observations.noise_group])
-        by_anchor = np.bincount(observations.anchor, loss * independent)
-        suspects = np.argsort(by_anchor)[::-1]
-        pair = find_swapped(fit.config, segments, fit.prior, fit.scale_m, suspects)
+        pair = find_swapped(fit.config, segments, fit.prior, fit.scale_m, _suspects(fit))
         if pair is not None:
             raise _swapped(fit.config.anchors, pair, "the others")
     if ratio_of_misfits > LIMITS.max_misfit_share:
@@ -314,10 +311,8 @@ def displacement_note(fit: JointFit) -> str:
     Unlike in `AnchorHypotheses`, tracks and offsets are fitted again with each displacement, so that few anchors suffice: a
     track that follows a displaced anchor hides it from the others. Walls can look the same.
     """
-    fits, observations = {}, fit.observations
-    loss = fit.config.model.loss(fit.residual_m / fit.scale_m[observations.noise_group])
-    suspects = np.argsort(np.bincount(observations.anchor, loss * observations.independent))[::-1]
-    for row in np.intersect1d(suspects[: LIMITS.suspects], observations.anchor).tolist():
+    fits = {}
+    for row in np.intersect1d(_suspects(fit)[: LIMITS.suspects], fit.observations.anchor).tolist():
         with contextlib.suppress(DatasetError):
             fits[row] = _displaced(fit, row)
     moved = {
@@ -338,6 +333,15 @@ def displacement_note(fit: JointFit) -> str:
             "compare it with `uwb-mitigation survey`"
         )
     return ""
+
+
+def _suspects(fit: JointFit) -> NDArray[np.intp]:
+    """Return the rows of anchors, that with the largest misfit first."""
+    observations = fit.observations
+    loss = fit.config.model.loss(fit.residual_m / fit.scale_m[observations.noise_group])
+    by_anchor = np.bincount(observations.anchor, loss * observations.independent)
+    suspects: NDArray[np.intp] = np.argsort(by_anchor)[::-1]
+    return suspects
 
 
 def _displaced(fit: JointFit, row: int) -> tuple[Anchor, float]:

@@ -5,16 +5,12 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
 from uwb_mitigation.types.stamps import NS_PER_S
-
-if TYPE_CHECKING:
-    pass
 
 OK = DiagnosticStatus.OK
 WARN = DiagnosticStatus.WARN

@@ -41,8 +41,8 @@ CONTRADICTED_S = 60.0
 
 TOO_SHORT = 10.0
 """Ranges contradict a position if the mean squares of the negative normalised innovations of two anchors are larger: obstacles do not
-make ranges shorter, and one such anchor alone does not spoil the position. Largest
-values with right anchors: 6.0 (six Hanyang runs), 2.1 (30 simulated drives); with two of five swapped, 24 or more for seven of ten pairs."""
+make ranges shorter, and one such anchor alone does not spoil the position. Largest values with right anchors: 6.0 (six Hanyang runs),
+2.1 (30 simulated drives); with two of five swapped, 24 or more for seven of ten pairs."""
 
 OBSTACLE_S = 1.5
 """If the ranges of exactly half of the anchors are too long, obstacles are the reason unless it lasts longer. Chosen in drives behind
