@@ -67,6 +67,7 @@ REFUSED = {
     f"driver -r __node:={'a' * 300}": "node name length should not exceed",
     f"driver -r __ns:=/{'a' * 300}": "invalid node namespace",
     f"driver -r uwb/range_raw:={'a' * 300}": "topic length should not exceed",
+    "mitigator -r uwb/range_corrected:=/uwb/range_raw": "/uwb/range_raw twice",
 }
 
 

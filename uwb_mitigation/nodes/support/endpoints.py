@@ -62,9 +62,9 @@ def create_publisher(node: LifecycleNode, kind: type, topic: str) -> Publisher:
     """Return a lifecycle publisher of ranges.
 
     Raises:
-        ParameterError: an overridden quality of service is invalid.
+        ParameterError: an overridden quality of service is invalid, or the node publishes this topic.
     """
-    with _translate_qos_errors(node, topic):
+    with _translate_errors(node, topic):
         # rclpy writes overrides into the given profile, so each publisher needs a copy.
         qos, overriding = QoSProfile(depth=DEPTH), QoSOverridingOptions.with_default_policies()
         return node.create_lifecycle_publisher(kind, topic, qos, qos_overriding_options=overriding)
@@ -81,11 +81,11 @@ def create_subscription(
     """Return a subscription; a best-effort one also receives from best-effort publishers, such as odometry.
 
     Raises:
-        ParameterError: an overridden quality of service is invalid.
+        ParameterError: an overridden quality of service is invalid, or the node publishes this topic.
     """
     overriding = QoSOverridingOptions.with_default_policies()
     qos = QoSProfile(depth=DEPTH, reliability=reliability)
-    with _translate_qos_errors(node, topic):
+    with _translate_errors(node, topic):
         return node.create_subscription(
             kind, topic, callback, qos, qos_overriding_options=overriding, **options
         )
@@ -104,7 +104,7 @@ def create_raw_subscription(
     finds the queue empty.
 
     Raises:
-        ParameterError: an overridden quality of service is invalid.
+        ParameterError: an overridden quality of service is invalid, or the node publishes this topic.
     """
     events = SubscriptionEventCallbacks(message_lost=on_lost)
     take = _RawCallback(callback)
@@ -167,13 +167,18 @@ def header(stamp_ns: int, frame_id: str) -> Header:
 
 
 @contextmanager
-def _translate_qos_errors(node: LifecycleNode, topic: str) -> Iterator[None]:
+def _translate_errors(node: LifecycleNode, topic: str) -> Iterator[None]:
     # rclpy raises various exception types for invalid overrides.
     try:
         yield
     except (RuntimeError, ValueError, TypeError, AttributeError, AssertionError, ParameterException) as error:
         name = node.resolve_topic_name(topic)
         prefix = f"qos_overrides.{name}."
+        own = node.get_publisher_names_and_types_by_node(node.get_name(), node.get_namespace())
+        if name in dict(own):
+            raise ParameterError(
+                f"this node uses {name} twice", valid="two topics: see the remappings"
+            ) from error
         if not any(given.startswith(prefix) for given in getattr(node, "given_parameters", ())):
             # An error of ROS, which may be transient.
             raise
