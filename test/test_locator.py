@@ -70,6 +70,7 @@ def stamp_ns(pose: PoseWithCovarianceStamped) -> int:
 def test_ranges_yield_poses_odometry_smoothed_poses_and_markers(ros: Ros, anchors: Path):
     locator = ros.start("locator", f"anchors:={anchors}", "rate:=0.0")
     locator.wait_for_output("locating")
+    monitor = ros.start("monitor")
     poses = ros.collect(PoseWithCovarianceStamped, "/uwb/pose")
     odometry = ros.collect(Odometry, "/uwb/odometry")
     smoothed = ros.collect(PoseWithCovarianceStamped, "/uwb/pose_smoothed")
@@ -123,6 +124,9 @@ def test_ranges_yield_poses_odometry_smoothed_poses_and_markers(ros: Ros, anchor
         "tag 9 lever arm",
         "tag 9 position",
     }
+    # A terminal without a browser shows it, too.
+    assert monitor.signal(signal.SIGINT) == 0, monitor.output
+    assert re.search("locator: .*Position of tag 9 lost", " ".join(monitor.output.split())), monitor.output
     assert locator.signal(signal.SIGINT) == 0, locator.output
 
 

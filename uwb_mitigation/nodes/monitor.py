@@ -1,13 +1,15 @@
-"""The node `monitor`: shows raw and corrected ranges live in the terminal, and a summary at the end."""
+"""The node `monitor`: shows ranges and what the nodes report live in the terminal, and a summary at the end."""
 
 from __future__ import annotations
 
 import contextlib
 import math
 import sys
+import time
 from collections import Counter, defaultdict, deque
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
 from numpy.typing import NDArray
 from rclpy.context import Context
 from rclpy.node import Node
@@ -18,7 +20,7 @@ from rich.text import Text
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 
 from uwb_mitigation.errors import RecordingError, UwbMitigationError, format_id
-from uwb_mitigation.nodes.support import endpoints
+from uwb_mitigation.nodes.support import diagnostics, endpoints
 from uwb_mitigation.nodes.support.spinning import spinning_node, stop_event
 from uwb_mitigation.types.measurement import CorrectedRange, Status, Truth
 from uwb_mitigation.types.ros import topics
@@ -33,6 +35,12 @@ MAX_LATENCIES = 100_000
 
 MAX_TRUTHS = 10_000
 """Number of latest truths that wait for their corrected ranges."""
+
+STALE_S = 5.0
+"""Nodes publish diagnostics each second: after this time one was stopped."""
+
+MAX_REPORTS = 20
+"""Number of nodes whose reports are kept."""
 
 _COLUMNS = ("anchor", "tag", "rate\nHz", "raw\nm", "corrected\nm", "sigma\nm", "status", "true\nm", "label")
 
@@ -127,17 +135,29 @@ class RangeStatistics:
 
 
 class Monitor(Node):
-    """Collects statistics of the three range topics."""
+    """Collects statistics of the three range topics, and the diagnostics of the nodes of this package.
+
+    Attributes:
+        reports: {node: (time of reception on the steady clock, s; level; message)}.
+    """
 
     def __init__(self, context: Context | None = None) -> None:
         super().__init__("monitor", context=context)
         self.statistics = RangeStatistics()
+        self.reports: dict[str, tuple[float, bytes, str]] = {}
+        self.create_subscription(DiagnosticArray, topics.DIAGNOSTICS, self._on_diagnostics, 10)
         for kind, topic, callback in (
             (RangeTruth, topics.RANGE_TRUTH, self._on_truth),
             (RangeCir, topics.RANGE_RAW, self._on_raw),
             (RangeCorrected, topics.RANGE_CORRECTED, self._on_corrected),
         ):
             self.create_subscription(kind, topics.relative(topic), callback, endpoints.RANGES, raw=True)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            name = status.name.removesuffix(diagnostics.NAME_END)
+            if name != status.name and (name in self.reports or len(self.reports) < MAX_REPORTS):
+                self.reports[name] = time.monotonic(), status.level, status.message
 
     def _on_raw(self, data: bytes) -> None:
         with contextlib.suppress(RecordingError):
@@ -190,6 +210,17 @@ def live_table(statistics: RangeStatistics, title: str, width: int = 80) -> Tabl
     return table
 
 
+def report_lines(reports: dict[str, tuple[float, bytes, str]], now_s: float) -> list[Text]:
+    """Return one line for each node: its name and message; `reports`: see `Monitor`, `now_s`: on the steady clock."""
+    styles = {diagnostics.OK: "green", diagnostics.WARN: "yellow", diagnostics.ERROR: "red"}
+    return [
+        Text(f"{name}: {text}", style=styles.get(level, ""))
+        if now_s - received_s < STALE_S
+        else Text(f"{name}: no diagnostics for {now_s - received_s:.0f} s", style="yellow")
+        for name, (received_s, level, text) in sorted(reports.copy().items())
+    ]
+
+
 def summary(statistics: RangeStatistics) -> Group:
     """Return counts, latency, and mean absolute errors of ranges whose truth is known."""
     statuses = ", ".join(
@@ -225,14 +256,15 @@ def summary(statistics: RangeStatistics) -> Group:
 
 
 def run_monitor() -> None:
-    """Show the ranges on the topics until Ctrl-C."""
+    """Show ranges and reports until Ctrl-C."""
     stop = stop_event()
     console = Console()
     try:
         with spinning_node(Monitor) as monitor:
             with Live(console=console, refresh_per_second=REFRESH_HZ) as live:
                 while not stop.wait(1 / REFRESH_HZ):
-                    live.update(live_table(monitor.statistics, "UWB ranges", console.width))
+                    table = live_table(monitor.statistics, "UWB ranges", console.width)
+                    live.update(Group(*report_lines(monitor.reports, time.monotonic()), table))
             console.print(summary(monitor.statistics))
     except UwbMitigationError as error:
         sys.exit(f"error: {error}")

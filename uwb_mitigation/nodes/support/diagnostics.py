@@ -19,6 +19,9 @@ ERROR = DiagnosticStatus.ERROR
 Description = tuple[str, bytes, str, dict[str, object]]
 """Hardware id, level, message and values of a diagnostic status."""
 
+NAME_END = ": ranges"
+"""End of the name of a status of this package, after the name of the node."""
+
 MAX_LATENCIES = 20_000
 """Number of latencies that are kept."""
 
@@ -29,7 +32,7 @@ def diagnostic_array(
     """Return a message with one status, stamped on the node's clock and named after the node."""
     status = DiagnosticStatus(
         level=level,
-        name=f"{node.get_fully_qualified_name().lstrip('/')}: ranges",
+        name=f"{node.get_fully_qualified_name().lstrip('/')}{NAME_END}",
         message=message,
         hardware_id=hardware_id,
         values=[KeyValue(key=key, value=str(value)) for key, value in entries.items()],
