@@ -34,13 +34,15 @@ RADIUS95 = math.sqrt(5.991 / 2.0)
 Means = Mapping[str, float]
 """Means of a pair or an anchor: `rate` (Hz); `nlos`, `lost`, `not_ok` (%); `residual`, corrected range minus distance to
 the estimated position (m); `evidence`, number of residuals; `stopped`, age of the last range if it is not recent, else 0 (s);
-`displaced`, held-out residual (m) of an anchor whose ranges fit another position (`fit_x`, `fit_y`, `moved` from the file, m), else 0. NaN: unknown."""
+`displaced`, held-out residual (m) of an anchor whose ranges fit another position (`fit_x`, `fit_y`, `moved` from the file, m), live the
+displacement without these, else 0. NaN: unknown."""
 
 
+_FITTED = "is not where the anchors file says: its ranges fit x = {fit_x:.2f}, y = {fit_y:.2f} m, {moved:.1f} m away"
+_DISPLACED = "is probably not where the anchors file says: at least {displaced:.1f} m away, or the height of the tag is wrong"
 FAULTS = (
     ("stopped", 0.0, BAD, "has not answered for {stopped:.0f} s: it is blocked or too far away, or check its power and PAN id."),
-    ("displaced", 0.0, BAD, "is not where the anchors file says: its ranges fit x = {fit_x:.2f}, y = {fit_y:.2f} m, "
-                            "{moved:.1f} m away. Measure it again, or run `uwb-mitigation survey`."),
+    ("displaced", 0.0, BAD, "{place}. Measure it again, or run `uwb-mitigation survey`."),
     # Without line of sight, ranges may be long although anchor and offset are right.
     ("blocked", LONG_M, CHECK, "reads {size:.2f} m {direction}, with {nlos:.0f} % NLOS: its line of sight is probably blocked. Move it if possible."),
     ("clear", VERY_LONG_M, BAD, "reads {size:.2f} m {direction}: calibrate, or check its position."),
@@ -59,6 +61,7 @@ def faults(means: Means, before: str = "") -> list[tuple[str, str]]:
     values: dict[str, Any] = {"blocked": 0.0, "clear": 0.0, "size": abs(residual_m), **means}
     values["blocked" if means["nlos"] > MAX_NLOS else "clear"] = abs(residual_m)
     values["direction"] = "long" if residual_m > 0.0 else "short"
+    values["place"] = (_FITTED if "fit_x" in means else _DISPLACED).format(**values)
     return [
         (fault, text.format(**values))
         for name, limit, fault, text in FAULTS
@@ -134,6 +137,7 @@ def degradation(
         reason, _, action = (common or texts[worst]).partition(": ")
         if (
             not common
+            and not anchors[worst]["displaced"]
             and sum(_is_wrong(means) for means in anchors.values()) > 1
             and _is_wrong(anchors[worst])
         ):

@@ -14,6 +14,7 @@ from uwb_mitigation.positioning import health
 from uwb_mitigation.positioning.determination import current_determination
 from uwb_mitigation.positioning.health import LONG_M, NO_DATA_INTERVALS, NO_DATA_S, Means, Verdict
 from uwb_mitigation.positioning.multi_tag import TagState
+from uwb_mitigation.positioning.residual_directions import ResidualDirections, displaced
 from uwb_mitigation.types.anchors import Anchor
 from uwb_mitigation.types.measurement import CorrectedRange, Status
 from uwb_mitigation.types.tracks import Estimate
@@ -39,6 +40,7 @@ class PositionMonitor:
         self._residuals = defaultdict[Anchor, deque[tuple[float, float, bool]]](
             lambda: deque(maxlen=MAX_RANGES)
         )
+        self._directions = defaultdict[int, ResidualDirections](ResidualDirections)
 
     @property
     def age_s(self) -> float:
@@ -50,7 +52,9 @@ class PositionMonitor:
         self._received_s, self._estimate = self._now_s(), estimate
         residual_m = math.nan
         if estimate is not None:
-            residual_m = corrected.range_m - math.dist(estimate.position.tolist(), anchor.position)
+            position = estimate.position.tolist()
+            residual_m = corrected.range_m - math.dist(position, anchor.position)
+            self._directions[anchor.id].add(corrected.range_m, position, anchor.position)
         # The power gap of the CIR, with which the viewer recognises NLOS, is not in corrected ranges.
         status = corrected.status
         is_uncertain = status is Status.OUT_OF_DISTRIBUTION or (
@@ -70,7 +74,7 @@ class PositionMonitor:
             return Verdict(health.UNDETERMINED, reason, remedy and f"Remedy: {remedy}")
         sd_m, anchors = math.sqrt(np.trace(estimate.covariance[:2, :2])), self._means()
         reason, action = statement, remedy and f"Remedy: {remedy}"
-        if current.is_unique:
+        if current.is_unique or any(means["displaced"] for means in anchors.values()):
             states = {key: health.state(means) for key, means in anchors.items()}
             names = {anchor.id: anchor.name for anchor in self._residuals}
             reason, action = health.degradation(anchors, states, names, sd_m)
@@ -92,12 +96,14 @@ class PositionMonitor:
     def _means(self) -> dict[int, Means]:
         """Return the means of each anchor that was received in the last minute, as the viewer has them of its pairs."""
         result, now_s = dict[int, Means](), self._now_s()
+        moved = displaced(self._directions) or (None, 0.0)
         for anchor, rows in self._residuals.items():
             received_s, residual_m, is_uncertain = np.array(rows).T
             age_s, known_m = now_s - float(received_s[-1]), residual_m[np.isfinite(residual_m)]
             interval_s = float(received_s[-1] - received_s[0]) / max(len(received_s) - 1, 1)
             if age_s < RECENT_S:
-                result[anchor.id] = dict.fromkeys(("rate", "lost", "not_ok", "displaced"), 0.0) | {
+                result[anchor.id] = dict.fromkeys(("rate", "lost", "not_ok"), 0.0) | {
+                    "displaced": moved[1] if anchor.id == moved[0] else 0.0,
                     "residual": float(known_m.mean()) if len(known_m) else math.nan,
                     "evidence": float(len(known_m)),
                     "nlos": 100.0 * float(is_uncertain.mean()),
