@@ -38,6 +38,8 @@ class ResidualDirections:
     def add(self, range_m: float, position: tuple[float, ...], anchor: tuple[float, ...]) -> None:
         """Add a range, with the position of the antenna and the anchor's, x, y, z in m."""
         distance_m = math.dist(position, anchor)
+        if distance_m == 0.0:
+            return
         if not self._places or math.dist(position[:2], self._places[-1][:2]) > STEP_M:
             self._places.append([*position[:2], 0.0, 0.0, 0.0, 0.0])
             self._fit = None
