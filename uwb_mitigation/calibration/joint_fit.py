@@ -435,10 +435,11 @@ class _JointProblem:
     def _linearised(
         self, unit: NDArray[np.float64], error_m: NDArray[np.float64], weight: NDArray[np.float64]
     ) -> LeastSquares:
-        problem, rows = self._without_ranges.copy(), self._derivatives(unit)
+        problem, knot, shared = self._without_ranges.copy(), self._observations.knot, self._observations.rows
+        values = self._derivatives(unit)[:, : problem.unknowns]
         # The unknowns are solved for, not their changes: motion and priors are linear in them.
-        x = np.append(self._x.reshape(-1), self._parameters)[self._columns]
-        problem.add(self._columns, rows, error_m + np.einsum("nc,nc->n", rows, x), weight)
+        of_knot = np.einsum("nc,nc->n", values, self._x[knot])
+        problem.add_at_knots(knot, values, shared, error_m + of_knot + shared @ self._parameters, weight)
         return problem
 
     def _motion_and_priors(self) -> LeastSquares:

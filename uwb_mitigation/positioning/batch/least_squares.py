@@ -116,6 +116,30 @@ class LeastSquares:
             self._band[below, : n - below] += knots.diagonal(-below)
         self._border += normal[:, n:].toarray()
 
+    def add_at_knots(
+        self,
+        knot: NDArray[np.intp],
+        values: NDArray[np.float64],
+        shared: NDArray[np.float64],
+        target: NDArray[np.float64],
+        weight: NDArray[np.float64],
+    ) -> None:
+        """Add n rows of one knot each, as `add` does, in a fraction of its time.
+
+        Args:
+            knot: int (n,). values, shared: float64 (n, b) and (n, q), of all unknowns of the knot and of all shared ones.
+            target: float64 (n,). weight: float64 (n,), inverse variances.
+        """
+        rows, b, n = len(knot), self.unknowns, self.knots * self.unknowns
+        of_knots = csr_matrix((weight, knot, np.arange(rows + 1)), shape=(rows, self.knots)).T
+        i, j = np.tril_indices(b)
+        self._band.reshape(2 * b, self.knots, b)[i - j, :, j] += (of_knots @ (values[:, i] * values[:, j])).T
+        with_shared = (values[:, :, None] * shared[:, None, :]).reshape(rows, -1)
+        self._border[:n] += (of_knots @ with_shared).reshape(n, -1)
+        self._border[n:] += (shared.T * weight) @ shared
+        self._right[:n] += (of_knots @ (values * target[:, None])).reshape(-1)
+        self._right[n:] += (shared.T * weight) @ target
+
     def add_prior(
         self,
         columns: NDArray[np.intp],
