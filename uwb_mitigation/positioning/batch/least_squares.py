@@ -127,8 +127,11 @@ class LeastSquares:
         """Add n rows of one knot each, as `add` does, in a fraction of its time.
 
         Args:
-            knot: int (n,). values, shared: float64 (n, b) and (n, q), of all unknowns of the knot and of all shared ones.
-            target: float64 (n,). weight: float64 (n,), inverse variances.
+            knot: int (n,).
+            values: float64 (n, b), of all unknowns of the knot.
+            shared: float64 (n, q), of all shared unknowns.
+            target: float64 (n,).
+            weight: float64 (n,), inverse variances.
         """
         rows, b, n = len(knot), self.unknowns, self.knots * self.unknowns
         of_knots = csr_matrix((weight, knot, np.arange(rows + 1)), shape=(rows, self.knots)).T
