@@ -7,12 +7,13 @@ channel model. The receiver model is in `simulation.radio`.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.types.columns import Columns
 
 SPEED_OF_LIGHT_M_PER_NS = 0.299792458
 
@@ -138,7 +139,7 @@ OUTDOOR_LOS = Environment("outdoor LOS", 45.6, 1.76, 0.83, 0.12, 6.0, 0.0048, (0
 
 
 @dataclass(frozen=True, slots=True)
-class DiffuseField:
+class DiffuseField(Columns):
     """Delays and mean powers of the rays of n placements; they change over metres.
 
     Attributes:
@@ -154,10 +155,6 @@ class DiffuseField:
     nakagami_m: NDArray[np.float64]
     shadowing_db: NDArray[np.float64]
     pattern_loss_db: NDArray[np.float64]
-
-    def take(self, index: NDArray[np.intp]) -> DiffuseField:
-        """Return the placements at `index`, in that order."""
-        return DiffuseField(*(getattr(self, field.name)[index] for field in fields(self)))
 
     def moved(
         self, end: DiffuseField, progress: NDArray[np.float64], changes_at: NDArray[np.float64]
