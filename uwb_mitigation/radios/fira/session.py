@@ -237,7 +237,7 @@ class UciSession(Session):
             self._begin(now_ns)
 
     def _handle(self, packet: Packet, now_ns: int, stamp_ns: int) -> None:
-        name, command = (packet.group, packet.opcode), self._commands.command
+        name, command = packet.name, self._commands.command
         if command is None:
             self._received_ns = now_ns
             self._state_requested = False
