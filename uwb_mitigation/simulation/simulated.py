@@ -200,7 +200,7 @@ class SimulatedSource(Simulated):
         self, sequence: NDArray[np.int64], segment: int, fields: tuple[DiffuseField, DiffuseField]
     ) -> TwrBatch:
         anchor = sequence % len(self._anchors)
-        travelled = SPEED_M_PER_S * sequence / self._rate_hz
+        travelled = np.asarray(SPEED_M_PER_S * sequence / self._rate_hz, np.float64)
         anchor_id = 1 + anchor
         names = [
             f"simulated seed {self._seed}/tag {TAG_ID}/anchor {number}/segment {segment}"
