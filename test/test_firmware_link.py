@@ -21,7 +21,6 @@ from uwb_mitigation.mitigation.model.bundle import Bundle
 from uwb_mitigation.radios.wire import messages
 from uwb_mitigation.radios.wire.framing import FrameDecoder, FrameEncoder, WireFrame, encode_frame
 from uwb_mitigation.radios.wire.layout import HEADER, MAX_OFFSETS, MAX_PAYLOAD_BYTES, Flag, MessageType, Mode
-from uwb_mitigation.radios.wire.messages import SetMode, SetOffsets
 from uwb_mitigation.types.measurement import RangeMeasurement
 from uwb_mitigation.types.offsets import Offsets
 
@@ -198,13 +197,13 @@ def test_board_in_c_sends_what_the_board_in_python_sends(library: ctypes.CDLL, b
         measured = firmware_models.random_measurement(random)
         wire = radio.encode(*messages.encode(measured))
         assert same(c.measure(wire, now_us), python.measure(measured, now_us))
-        changes = SetMode(Mode(int(random.integers(0, 2)))), SetOffsets(some_offsets(random))
+        changes = Mode(int(random.integers(0, 2))), some_offsets(random)
         requests = [MessageType.GET_INFO, MessageType.TIME_SYNC, measured, *changes, None]
         request = requests[int(random.choice(6, p=[0.1, 0.1, 0.3, 0.1, 0.2, 0.2]))]
         if request is None:
             kind, payload = int(random.integers(0, 256)), random.bytes(int(random.integers(0, 120)))
             if random.random() < 0.5:
-                kind, payload = messages.encode(SetOffsets(some_offsets(random)))
+                kind, payload = messages.encode(some_offsets(random))
                 payload = damaged(payload, random)
         else:
             kind, payload = messages.encode(request)
@@ -224,7 +223,7 @@ def test_host_of_another_version_receives_the_version_of_the_board(library: ctyp
 
 def test_board_without_a_model_stays_in_host_mode(library: ctypes.CDLL):
     c = BoardInC(library, Mode.DEVICE, with_model=False)
-    request = FrameEncoder().encode(*messages.encode(SetMode(Mode.DEVICE)))
+    request = FrameEncoder().encode(*messages.encode(Mode.DEVICE))
     (frame,) = FrameDecoder().feed(c.receive(request, 1))
     hello = messages.decode(frame.type, frame.payload)
     assert (hello.mode, hello.model_id, hello.window, frame.flags) == (Mode.HOST, 0, 0, Flag.ANSWER)

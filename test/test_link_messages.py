@@ -28,7 +28,7 @@ from uwb_mitigation.radios.settings import (
 from uwb_mitigation.radios.wire import layout, messages
 from uwb_mitigation.radios.wire.framing import FrameDecoder, WireFrame, encode_frame
 from uwb_mitigation.radios.wire.layout import Flag, LogLevel, MessageType, Mode
-from uwb_mitigation.radios.wire.messages import Hello, OffsetsAnswer, SetMode, SetOffsets, TimeSyncReply
+from uwb_mitigation.radios.wire.messages import Hello, OffsetsAnswer, TimeSyncReply
 from uwb_mitigation.types.measurement import (
     Cir,
     CorrectedBy,
@@ -80,7 +80,7 @@ ANCHORS = AnchorStatus(1, 20, 7, -80.5, 12), AnchorStatus(2**64 - 2, 8, 0, math.
 STATUS = RadioStatus(28, 7, 6, 5, 4, 3, 2, 1, 9, 10, 31.5, 3.25, RadioState.BUS, ANCHORS)
 SENT = {
     "get_info": (MessageType.GET_INFO, 0, 0, 0),
-    "set_mode": (SetMode(Mode.DEVICE), 0, 1, 0),
+    "set_mode": (Mode.DEVICE, 0, 1, 0),
     "time_sync": (MessageType.TIME_SYNC, 0, 0xFFFFFFFF, 0),
     "hello": (HELLO, Flag.ANSWER, 0, 1_000_000),
     "time_sync_reply": (TimeSyncReply(0xFFFFFFFF, 2**40 + 17), Flag.ANSWER, 1, 2**40 + 20),
@@ -92,10 +92,10 @@ SENT = {
     "range_cir_full": (measured(math.nan, FULL), 0, 7, 6_000_000),
     "range_corrected": (correction(CORRECTED, 7040), 0, 8, 7_000_000),
     "range_corrected_invalid": (correction(INVALID), Flag.ANSWER, 9, 0),
-    "set_offsets": (SetOffsets(OFFSETS), 0, 4, 0),
+    "set_offsets": (OFFSETS, 0, 4, 0),
     "offsets": (OffsetsAnswer(4, 64, True), Flag.ANSWER, 13, 9_000_000),
     "get_radio": (MessageType.GET_RADIO, 0, 2, 0),
-    "set_radio": (messages.SetRadio(SETTINGS), 0, 3, 0),
+    "set_radio": (SETTINGS, 0, 3, 0),
     "radio": (messages.RadioConfigured(SETTINGS, 3), Flag.ANSWER, 10, 8_000_000),
     "radio_refused": (REFUSED, Flag.ANSWER, 11, 8_000_000),
     "radio_status": (STATUS, 0, 12, 9_000_000),
@@ -245,7 +245,7 @@ def test_impossible_value_of_a_field_is_an_error(name, field, code, value, error
             measured(1.0, replace(CIR, **large))
             for large in ({"preamble_count": 65536}, {"rx_power_dbm": 1e39})
         ),
-        SetMode(-1),
+        TimeSyncReply(-1, 0),
         TimeSyncReply(2**32, 0),
     ],
     ids=["samples", "preamble", "float", "negative", "32 bits"],

@@ -17,7 +17,7 @@ from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.recordings import formats
-from uwb_mitigation.recordings.truth_table import load_truth, with_truth
+from uwb_mitigation.recordings.csv_tables import load_truth, with_truth
 from uwb_mitigation.training.fit import linear_fit
 from uwb_mitigation.types.measurement import Record, Truth
 

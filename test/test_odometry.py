@@ -119,7 +119,7 @@ def test_messages_with_invalid_values_are_skipped(tmp_path: Path, monkeypatch: p
             out.write_message("/odom", ODOMETRY_TYPE, encode_odometry_row(odometry, row), row)
             out.write_message("/imu", IMU_TYPE, encode_imu_row(imu, row), row)
             with monkeypatch.context() as patch:
-                patch.setattr(codec, "_UNMEASURED", -1.0)
+                patch.setattr(codec, "UNOBSERVED", -1.0)
                 out.write_message("/no_gyro", IMU_TYPE, encode_imu_row(imu, row), row)
             broken = replace(odometry, twist=twist * np.nan)
             out.write_message("/broken", ODOMETRY_TYPE, encode_odometry_row(broken, row), row)

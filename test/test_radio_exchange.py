@@ -19,7 +19,6 @@ from uwb_mitigation.radios.serial import BoardPort, SerialSettings
 from uwb_mitigation.radios.settings import PREAMBLES, PortMessage, RadioSettings, Role
 from uwb_mitigation.radios.wire import messages
 from uwb_mitigation.radios.wire.events import Refused
-from uwb_mitigation.radios.wire.messages import SetRadio
 from uwb_mitigation.radios.wire.session import BoardSession
 from uwb_mitigation.types.measurement import RangeMeasurement
 
@@ -205,7 +204,7 @@ def test_settings_that_a_board_does_not_support_are_refused_with_a_reason():
         board, session = air.add(RadioSettings(), serial_link=SerialLink()), BoardSession()
         session.opened(0)
         talk(air, board, session, 0.5)
-        request = SetRadio(RadioSettings(channel=6))
+        request = RadioSettings(channel=6)
         assert messages.decode(*messages.encode(request)) == request
         session._radio_request.begin(request)
         (refusal,) = (event for event in talk(air, board, session, 1.0) if isinstance(event, Refused))

@@ -17,7 +17,6 @@ from uwb_mitigation.errors import LinkError
 from uwb_mitigation.radios.dw1000.native import Io, NativeRadio, load_native
 from uwb_mitigation.radios.settings import RadioSettings, RadioState, RadioStatus, Role, status_warning
 from uwb_mitigation.radios.wire import messages
-from uwb_mitigation.radios.wire.messages import SetRadio
 from uwb_mitigation.types.measurement import RangeMeasurement
 
 pytestmark = NEEDS_CC
@@ -201,7 +200,7 @@ def test_antenna_delay_of_a_trek1000_is_from_otp(
 @pytest.mark.parametrize(("rate_kbps", "refused"), [(6800, True), (850, False)])
 def test_reply_within_the_pause_of_smart_power_is_refused(rate_kbps: int, refused: bool):
     """FINAL must not be sent within 1 ms after POLL with more power than the average limit."""
-    _, payload = messages.encode(SetRadio(RadioSettings(rate_kbps=rate_kbps, preamble=64, reply_us=999)))
+    _, payload = messages.encode(RadioSettings(rate_kbps=rate_kbps, preamble=64, reply_us=999))
     settings = payload, len(payload), 0, 0
     radio = load_native().native_radio_new(ctypes.byref(Io()), *settings, 1)
     assert (load_native().native_radio_configure(radio, *settings) is not None) == refused

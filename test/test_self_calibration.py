@@ -88,7 +88,7 @@ def test_carried_tag_at_16_positions_determines_offset_and_ranges():
         stamp = np.arange(8) * 10**8 + number * 60 * 10**9
         placements.append(Ranges(stamp, row, range_m, np.full(8, np.nan), power))
         truth.append(distance[row])
-    carried = Ranges.joined(placements)
+    carried = Ranges.of_tags(placements)
     power = Regressors.single("level", carried.rx_power_dbm - np.median(carried.rx_power_dbm), 0.0, SLOPE_SD)
     found = self_calibrate(anchors, [carried], power, height=LEVEL)
     assert found.segments.is_stationary.tolist() == [True] * 16

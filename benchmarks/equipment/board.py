@@ -26,8 +26,6 @@ from uwb_mitigation.radios.wire.messages import (
     Correction,
     Hello,
     OffsetsAnswer,
-    SetMode,
-    SetOffsets,
     TimeSyncReply,
 )
 from uwb_mitigation.types.measurement import CorrectedRange, RangeMeasurement
@@ -129,14 +127,14 @@ class Board:
             message = None
         if message is MessageType.GET_INFO:
             return self._hello(now_us, frame.sequence)
-        if isinstance(message, SetMode):
-            if self._corrector is not None or message.mode is Mode.HOST:
-                self.mode = message.mode
+        if isinstance(message, Mode):
+            if self._corrector is not None or message is Mode.HOST:
+                self.mode = message
             return self._hello(now_us, frame.sequence)
-        if isinstance(message, SetOffsets):
-            accepted = len(message.offsets) <= MAX_OFFSETS
+        if isinstance(message, Offsets):
+            accepted = len(message) <= MAX_OFFSETS
             if accepted and self._corrector is not None:
-                self._corrector.offsets = message.offsets
+                self._corrector.offsets = message
             return self._send(OffsetsAnswer(frame.sequence, MAX_OFFSETS, accepted), now_us, Flag.ANSWER)
         if message is MessageType.TIME_SYNC:
             return self._send(TimeSyncReply(frame.sequence, now_us), now_us, Flag.ANSWER)

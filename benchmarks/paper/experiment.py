@@ -130,7 +130,7 @@ def run_experiment(
             "a training process was killed", valid="fewer workers, or more memory"
         ) from error
     models, test = dict(zip(ordered, results, strict=False)), data_split.test
-    median = baselines.overall_median(data_split.train)(test)
+    median = baselines.overall_median(data_split.train)
     result = ExperimentResults(
         data=data_split.data,
         split=data_split.split,

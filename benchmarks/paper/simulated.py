@@ -20,7 +20,6 @@ from uwb_mitigation.simulation.radio import Receiver
 from uwb_mitigation.simulation.scene import DirectPath
 from uwb_mitigation.simulation.simulated import (
     BATCH,
-    FIRST_TAG_ID,
     PLACEMENTS_RATE_HZ,
     Simulated,
     TwrBatch,
@@ -106,12 +105,10 @@ class SimulatedDeepUwb(Simulated):
         ]
         # One day per room.
         sequence = round(number * 86_400 * PLACEMENTS_RATE_HZ) + batch * size + np.arange(size)
-        ids = np.ones(size, np.int64)
         return (
             TwrBatch(
                 sequence,
-                (FIRST_ANCHOR_ID + number) * ids,
-                FIRST_TAG_ID * ids,
+                np.full(size, FIRST_ANCHOR_ID + number),
                 [names[k] for k in placement_of_row.tolist()],
                 AntennaPairs(
                     anchor[placement_of_row],

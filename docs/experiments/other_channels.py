@@ -35,10 +35,10 @@ def evaluate(path: Path, channel: Channel) -> str:
     )
     data = Dataset.joined(list(map(simulate, range(BLOCKS))))
     network_m = data.with_early_paths(Session(bundle).predict_m(data.inputs)).astype(np.float32)
-    corrections = correct_with_card(data, bundle.card, network_m)
-    rows = ~corrections.passed_through
-    error_m = np.abs(data.error_m - corrections.correction_m)
-    ratio = np.sqrt(2.0) * error_m / np.sqrt(corrections.variance_m2)
+    correction_m, variance_m2, is_passed_through = correct_with_card(data, bundle.card, network_m)
+    rows = ~is_passed_through
+    error_m = np.abs(data.error_m - correction_m)
+    ratio = np.sqrt(2.0) * error_m / np.sqrt(variance_m2)
     means = [float(ratio[rows & (data.labels == label)].mean()) for label in CONDITION_SHARES]
     factor = np.average(means, weights=list(CONDITION_SHARES.values()))
     mae_m = np.abs(data.error_m).mean(), error_m.mean()

@@ -25,7 +25,7 @@ if __name__ == "__main__":
         for boards, wide_share in (("usual", 0.0), ("other", 1.0)):
             data = building_dataset(SEED, BLOCKS, bundle.card.preprocessing, 2, wide_share=wide_share)
             network_m = data.with_early_paths(Session(bundle).predict_m(data.inputs)).astype(np.float32)
-            corrections = correct_with_card(data, bundle.card, network_m)
+            correction_m, _, is_passed_through = correct_with_card(data, bundle.card, network_m)
             constant_m = np.median(data.error_m[data.labels == "LOS"])
             sites = np.array([name.split("/")[1].split(" ")[0] for name in data.configurations.tolist()])
             groups = {"all": sites == sites} | {
@@ -33,8 +33,6 @@ if __name__ == "__main__":
             }
             for name, rows in groups.items():
                 error_m = data.error_m[rows]
-                residuals = (error_m, error_m - constant_m, error_m - corrections.correction_m[rows])
+                residuals = (error_m, error_m - constant_m, error_m - correction_m[rows])
                 text = " ".join(f"{np.abs(values).mean():7.3f}" for values in residuals)
-                print(
-                    f"  {boards:6}{name:10}{rows.sum():7}{text} {corrections.passed_through[rows].mean():7.1%}"
-                )
+                print(f"  {boards:6}{name:10}{rows.sum():7}{text} {is_passed_through[rows].mean():7.1%}")

@@ -79,7 +79,7 @@ def find_segments(tags: Sequence[Ranges]) -> Segments:
             stationary.append(is_stationary)
     tag_of, row_of = np.concatenate(tag), np.concatenate(row)
     kept_ranges = [tag_ranges.take(row_of[tag_of == number]) for number, tag_ranges in enumerate(tags)]
-    columns = Ranges.joined(kept_ranges)
+    columns = Ranges.of_tags(kept_ranges)
     return Segments(
         columns, tag_of, row_of, np.concatenate(segment), np.array(stationary), np.zeros(len(columns))
     )

@@ -208,7 +208,7 @@ class _AlignmentProblem:
         cls, anchors: AnchorMap, tags: Sequence[Ranges], paths: Sequence[PosePath], regressors: Regressors
     ) -> tuple[_AlignmentProblem, tuple[tuple[int, int], ...]]:
         """Return the problem of all ranges, and its pairs."""
-        ranges = Ranges.joined(tags)
+        ranges = Ranges.of_tags(tags)
         tag = np.repeat(np.arange(len(tags)), list(map(len, tags)))
         pairs, pair = np.unique(np.stack([tag, ranges.anchor]), axis=1, return_inverse=True)
         position, smoothed = anchors.position[ranges.anchor], [path.smoothed() for path in paths]

@@ -317,7 +317,7 @@ def solve_with_truth(
     """
     localisation = localisation.select([tag.tag_id for tag in site.tags])
     paths = [
-        PosePath.joined([path.shifted(by_ns) for path, by_ns in zip(paths, site.shift_ns, strict=True)])
+        PosePath.merged([path.shifted(by_ns) for path, by_ns in zip(paths, site.shift_ns, strict=True)])
         for paths in localisation.paths
     ]
     align = functools.partial(align_poses, site.anchors, site.tags, paths, regressors(site, has_truth=True))

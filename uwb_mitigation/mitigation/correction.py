@@ -79,17 +79,10 @@ class CorrectionRule:
         pairs = zip(predicted.tolist(), score.tolist(), strict=True)
         return [low <= error_m <= high and value < 1.0 for error_m, value in pairs]
 
-    def score(
-        self,
-        windows: NDArray[np.float32],
-        range_m: NDArray[np.floating],
-        rx_power_dbm: NDArray[np.floating],
-        first_path_power_dbm: NDArray[np.floating],
-    ) -> NDArray[np.float32]:
-        """Return the OOD score of n measurements, float32 (n,); 0 if the card has no bands."""
+    def score(self, windows: NDArray[np.float32], *reported: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Return the OOD score of n measurements, float32 (n,); 0 if the card has no bands. Arguments: see `ood_features`."""
         if self._ood_detector is None:
             return np.zeros(len(windows), np.float32)
-        reported = range_m, rx_power_dbm, first_path_power_dbm
         if len(windows) == 1:
             numbers = (float(values[0]) for values in reported)
             score = self._ood_detector.score(approximate_features(windows[0], self._scaling, *numbers))
@@ -364,11 +357,9 @@ class OnnxBackend:
         rejected[accepted] = False
         status[rejected] = np.where(np.isfinite(predicted[rejected]), _OUT_OF_DISTRIBUTION, _MODEL_ERROR)
         corrected = pass_through(self.bundle, ranges, offset_m, status, faults)
-        corrected.range_m[accepted], corrected.correction_m[accepted], corrected.variance_m2[accepted] = (
-            corrected_m,
-            correction,
-            variance,
-        )
+        corrected.range_m[accepted] = corrected_m
+        corrected.correction_m[accepted] = correction
+        corrected.variance_m2[accepted] = variance
         return corrected
 
     def _predict(

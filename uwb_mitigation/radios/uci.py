@@ -11,7 +11,7 @@ from typing import Any
 from uwb_mitigation.errors import LinkError, ParameterError, format_id
 from uwb_mitigation.radios.capture import Capture
 from uwb_mitigation.radios.fira.calibration import OriginalsFile
-from uwb_mitigation.radios.fira.codes import EXCHANGE_CAUSES
+from uwb_mitigation.radios.fira.codes import EXCHANGE_REMEDIES, UNEXPECTED_CAUSES
 from uwb_mitigation.radios.fira.session import UciSession, UciSettings
 from uwb_mitigation.radios.port import (
     ExchangeMonitor,
@@ -110,11 +110,9 @@ class UciPort(StreamPort):
     _tick_s = 0.01
 
     def __init__(self, settings: UciPortSettings, place: StreamPlace) -> None:
-        remedies = {cause.name: cause.remedy for cause in EXCHANGE_CAUSES.values()}
-        unexpected = [cause.name for cause in EXCHANGE_CAUSES.values() if cause.unexpected]
         self._originals = OriginalsFile(str(settings.address))
         session = UciSession(settings.board, self._originals)
-        super().__init__(settings, session, ExchangeMonitor(remedies, unexpected), place)
+        super().__init__(settings, session, ExchangeMonitor(EXCHANGE_REMEDIES, UNEXPECTED_CAUSES), place)
         self._starts = 0
         self._worked_ns = self._stop_ns = 0
 

@@ -168,11 +168,11 @@ class DecaRangingLog(Source):
         frame_kind: CirFrame | None = None  # kind of the frame in RX DATA
         cir_owner: CirFrame | None = None  # kind of the frame that a CIR would belong to
         frames: dict[CirFrame, tuple[int, Cir]] = {}
-        channel = prf = tag = anchor = 0
+        tag, anchor, without_samples = 0, 0, _NO_CIR
         for match in _TOKEN.finditer(text):
             kind = match.lastgroup
             if kind == "prf":
-                channel, prf = int(match["channel"]), int(match["prf"])
+                without_samples = replace(_NO_CIR, channel=int(match["channel"]), prf_mhz=int(match["prf"]))
             elif kind == "frame":
                 # IEEE 802.15.4 with 64-bit addresses, then the function code
                 frame = bytes.fromhex(match["frame"].decode())
@@ -188,7 +188,7 @@ class DecaRangingLog(Source):
                         self._count(Anomaly.NO_RANGE)
                     if cir_owner is CirFrame.POLL:
                         frames.clear()
-                    frames[cir_owner] = time, self._diagnostics(match, channel, prf)
+                    frames[cir_owner] = time, self._diagnostics(match, without_samples)
             elif kind == "pairs":
                 length, lines = int(match["length"]), match["pairs"].count(b"\n")
                 if match.end() == len(text) and lines < length:
@@ -201,8 +201,7 @@ class DecaRangingLog(Source):
                     frames[cir_owner] = time, self._with_samples(cir, match["pairs"])
                 cir_owner = None
             elif kind == "range":
-                empty = replace(_NO_CIR, channel=channel, prf_mhz=prf)
-                time, cir = frames.get(self._cir_frame, (latest or 0, empty))
+                time, cir = frames.get(self._cir_frame, (latest or 0, without_samples))
                 if len(cir) == 0:
                     self._count(Anomaly.NO_CIR)
                 stamp_ns = base_ns + ticks * NS_PER_S // int(DEVICE_TICK_HZ)
@@ -216,18 +215,16 @@ class DecaRangingLog(Source):
         if frames:
             self._count(Anomaly.NO_RANGE)
 
-    def _diagnostics(self, match: re.Match[bytes], channel: int, prf: int) -> Cir:
+    def _diagnostics(self, match: re.Match[bytes], cir: Cir) -> Cir:
         power, first = (self._number(match[name], -1000.0, 1000.0) for name in ("power", "first"))
         return replace(
-            _NO_CIR,
+            cir,
             # fixed point: ten integer and six fractional bits
             first_path_index=self._number(match["path"], 0.0, 1024 - 2**-6),
             preamble_count=int(match["preamble"]),
             noise_threshold=int(match["noise"], 16),
             rx_power_dbm=power,
             first_path_power_dbm=first,
-            channel=channel,
-            prf_mhz=prf,
         )
 
     def _with_samples(self, cir: Cir, pairs: bytes) -> Cir:

@@ -55,53 +55,46 @@ class UpToDamage(io.RawIOBase):
         super().close()
 
 
-class TextBlocks:
-    """The lines of a text file, in blocks that end with a line break, and not within quotes.
+def text_blocks(path: Path, on_warning: OnWarning | None, quote: str = "") -> Iterator[str]:
+    """Yield the lines of a text file, in blocks that end with a line break, and not within quotes.
 
     Args:
         path: the file.
-        quote: the mark of quotes; empty: none.
         on_warning: called if the last line has no line break, and is not yielded; None: it is yielded. The only line of a
             file is always yielded.
+        quote: the mark of quotes; empty: none.
 
     Raises:
-        RecordingError: from the iteration: a quote is not closed, or the file is empty or a decompression bomb.
-        DamagedRecordingError: from the iteration: the file ends early, after yielding the lines before.
+        RecordingError: a quote is not closed, or the file is empty or a decompression bomb.
+        DamagedRecordingError: the file ends early, after yielding the lines before.
     """
-
-    def __init__(self, path: Path, on_warning: OnWarning | None, quote: str = "") -> None:
-        self._path, self._quote, self._on_warning = path, quote, on_warning
-
-    def __iter__(self) -> Iterator[str]:
-        limit, total = max(MAX_EXPANSION * self._path.stat().st_size, MIN_BOMB_CHARS), 0
-        unread, yielded = "", False
-        with UpToDamage(self._path) as source:
-            buffered = io.BufferedReader(source)
-            text = io.TextIOWrapper(buffered, _encoding(buffered.peek(4096)), errors="replace")
-            while len(unread) < MAX_ROW_CHARS and (data := text.read(BLOCK_CHARS)):
-                total, unread = total + len(data), unread + data
-                if total > limit:
-                    what = f"the file expands to more than {MAX_EXPANSION} times its size"
-                    raise RecordingError(what, where=str(self._path), valid="no decompression bomb")
-                end = unread.rfind("\n") + 1
-                if self._quote and unread.count(self._quote, 0, end) % 2:
-                    end = unread.rfind("\n", 0, unread.rfind(self._quote, 0, end)) + 1
-                if end:
-                    yield unread[:end]
-                    unread, yielded = unread[end:], True
-        if len(unread) >= MAX_ROW_CHARS or ("\n" in unread and not source.damage):
-            what = f"a closing quote or a line break is missing after {unread[:60]!r}"
-            raise RecordingError(what, where=str(self._path))
-        if source.damage:
-            raise DamagedRecordingError(f"truncated or corrupt: {source.damage}", where=str(self._path))
-        if unread and self._on_warning and yielded:
-            self._on_warning(
-                f"{self._path.name}: the file does not end with a line break; the last row is not used"
-            )
-        elif unread:
-            yield unread
-        elif not yielded:
-            raise RecordingError("the file is empty", where=str(self._path))
+    limit, total = max(MAX_EXPANSION * path.stat().st_size, MIN_BOMB_CHARS), 0
+    unread, yielded = "", False
+    with UpToDamage(path) as source:
+        buffered = io.BufferedReader(source)
+        text = io.TextIOWrapper(buffered, _encoding(buffered.peek(4096)), errors="replace")
+        while len(unread) < MAX_ROW_CHARS and (data := text.read(BLOCK_CHARS)):
+            total, unread = total + len(data), unread + data
+            if total > limit:
+                what = f"the file expands to more than {MAX_EXPANSION} times its size"
+                raise RecordingError(what, where=str(path), valid="no decompression bomb")
+            end = unread.rfind("\n") + 1
+            if quote and unread.count(quote, 0, end) % 2:
+                end = unread.rfind("\n", 0, unread.rfind(quote, 0, end)) + 1
+            if end:
+                yield unread[:end]
+                unread, yielded = unread[end:], True
+    if len(unread) >= MAX_ROW_CHARS or ("\n" in unread and not source.damage):
+        what = f"a closing quote or a line break is missing after {unread[:60]!r}"
+        raise RecordingError(what, where=str(path))
+    if source.damage:
+        raise DamagedRecordingError(f"truncated or corrupt: {source.damage}", where=str(path))
+    if unread and on_warning and yielded:
+        on_warning(f"{path.name}: the file does not end with a line break; the last row is not used")
+    elif unread:
+        yield unread
+    elif not yielded:
+        raise RecordingError("the file is empty", where=str(path))
 
 
 def _encoding(head: bytes) -> str:

@@ -1,12 +1,14 @@
-"""Antenna pairs at given positions: obstacles, and shared diffuse fields."""
+"""Antenna pairs at given positions: obstacles, shared diffuse fields, and the received paths."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.simulation import channel
 from uwb_mitigation.simulation.scene import DirectPath, Point
 
@@ -67,25 +69,60 @@ class AntennaPairs:
     def multipath(self, rng: np.random.Generator) -> channel.Multipath:
         """Return the received paths of each link; a link without obstacles uses the LOS environment."""
         path, distance = self.path, self.distance_m
-        rays = self.fields[0].delay_ns.shape[1]
-        delay = np.empty((len(distance), 1 + rays))
-        gain = np.empty((len(distance), 1 + rays), np.complex128)
+        shape = len(distance), 1 + self.fields[0].delay_ns.shape[1]
+        delay, gain = np.empty(shape), np.empty(shape, np.complex128)
         for environment, field, nlos in zip(self.environments, self.fields, (False, True), strict=True):
             (rows,) = np.nonzero((path.crossings > 0) == nlos)
             field_rows = self.field_of[rows]
-            fading = field.fade(rng)[field_rows] if self.stationary else field.take(field_rows).fade(rng)
-            received = channel.propagate(
-                distance[rows],
-                path.loss_db[rows],
-                path.excess_m[rows],
-                environment,
-                field.take(field_rows),
-                fading,
-                path.channel,
-                rng,
-            )
+            rays = field.take(field_rows)
+            fading = field.fade(rng)[field_rows] if self.stationary else rays.fade(rng)
+            received = propagate(distance[rows], path.take(rows), environment, rays, fading, rng)
             delay[rows], gain[rows] = received.delay_ns, received.gain
         return channel.Multipath(delay, gain)
+
+
+def propagate(
+    distance_m: NDArray[np.float64],
+    path: DirectPath,
+    environment: channel.Environment,
+    field: channel.DiffuseField,
+    fading: NDArray[np.complex128],
+    rng: np.random.Generator,
+) -> channel.Multipath:
+    """Join the direct path and the diffuse field of n pairs.
+
+    For LOS, the environment's path loss gives the power of all paths, so the diffuse field has this power minus
+    that of the direct path, but at least a twentieth (at short distances the direct path can have all of it). For
+    NLOS, the environment's path loss is that of the diffuse field itself.
+
+    Args:
+        distance_m: straight-line distance, float64 (n,).
+        path: obstacles between the antennas.
+        environment: environment of all pairs.
+        field: diffuse fields of n pairs; see `draw_fields`.
+        fading: gains of the rays, complex128 (n, rays).
+        rng: source of the phase of the direct path.
+
+    Raises:
+        ParameterError: a distance is not finite and positive.
+    """
+    if not bool(np.all(np.isfinite(distance_m) & (distance_m > 0))):
+        raise ParameterError("distance that is not finite and positive", where="channel", valid="> 0 m")
+    direct = 10.0 ** (
+        channel.direct_power_db(distance_m, path.loss_db + field.pattern_loss_db, path.channel) / 10.0
+    )
+    diffuse = 10.0 ** (-environment.path_loss_db(distance_m, path.channel) / 10.0)
+    if environment.first_cluster_delay_ns == 0.0:
+        diffuse = np.maximum(diffuse - direct, 0.05 * diffuse)
+    diffuse = diffuse * 10.0 ** (field.shadowing_db / 10.0)
+    phase = rng.uniform(0.0, 2.0 * math.pi, len(distance_m))
+    gain = np.concatenate(
+        [(np.sqrt(direct) * np.exp(1j * phase))[:, None], np.sqrt(diffuse)[:, None] * fading], axis=1
+    )
+    delay = np.concatenate(
+        [(path.excess_m / channel.SPEED_OF_LIGHT_M_PER_NS)[:, None], field.delay_ns], axis=1
+    )
+    return channel.Multipath(delay, gain)
 
 
 def draw_fields(

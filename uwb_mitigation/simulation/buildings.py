@@ -16,7 +16,7 @@ from uwb_mitigation.simulation import channel, scene
 from uwb_mitigation.simulation.antenna_pairs import AntennaPairs, Environments, draw_fields, place
 from uwb_mitigation.simulation.channel import Environment
 from uwb_mitigation.simulation.radio import Boards, Receiver
-from uwb_mitigation.simulation.scene import FLAT, Building, DirectPath, Screen, Wall
+from uwb_mitigation.simulation.scene import FLAT, Building, DirectPath, Point, Screen, Wall
 
 RESIDENTIAL: Environments = (channel.RESIDENTIAL_LOS, channel.RESIDENTIAL_NLOS)
 OFFICE: Environments = (channel.OFFICE_LOS, channel.OFFICE_NLOS)
@@ -111,7 +111,7 @@ CANDIDATES = 16
 """Candidate placements for each one that is kept."""
 
 
-def mean_free_path_m(size: tuple[float, float]) -> float:
+def mean_free_path_m(size: Point) -> float:
     """Return the mean free path of rays in a rectangle: pi area / perimeter (Kosten, 1960)."""
     return math.pi * size[0] * size[1] / (2.0 * (size[0] + size[1]))
 
@@ -138,13 +138,7 @@ def draw_plan(kind: BuildingType, rng: np.random.Generator) -> Building:
     return Building(size, tuple(walls), tuple(screens))
 
 
-def _divide(
-    low: tuple[float, float],
-    high: tuple[float, float],
-    room_m: float,
-    rng: np.random.Generator,
-    walls: list[Wall],
-) -> None:
+def _divide(low: Point, high: Point, room_m: float, rng: np.random.Generator, walls: list[Wall]) -> None:
     """Halve a rectangle across its longer side, about in the middle, until rooms are small enough."""
     sides = high[0] - low[0], high[1] - low[1]
     axis = 0 if sides[0] >= sides[1] else 1
@@ -158,12 +152,7 @@ def _divide(
     _divide((split, low[1]) if axis == 0 else (low[0], split), high, room_m, rng, walls)
 
 
-def _wall(
-    start: tuple[float, float],
-    end: tuple[float, float],
-    rng: np.random.Generator,
-    doors_m: NDArray[np.float64],
-) -> list[Wall]:
+def _wall(start: Point, end: Point, rng: np.random.Generator, doors_m: NDArray[np.float64]) -> list[Wall]:
     """Return the pieces of a wall of one material between doorways at `doors_m` from its start."""
     choices = HEAVY if rng.random() < HEAVY_SHARE else LIGHT
     material, bounds = choices[int(rng.integers(len(choices)))]
@@ -179,11 +168,11 @@ def _wall(
     ]
 
 
-def _along(start: tuple[float, float], unit: tuple[float, float], by: float) -> tuple[float, float]:
+def _along(start: Point, unit: Point, by: float) -> Point:
     return start[0] + by * unit[0], start[1] + by * unit[1]
 
 
-def _screen(name: str, length_m: float, size: tuple[float, float], rng: np.random.Generator) -> Screen:
+def _screen(name: str, length_m: float, size: Point, rng: np.random.Generator) -> Screen:
     x, y, angle = (float(v) for v in rng.uniform((0.0, 0.0, 0.0), (*size, math.pi)))
     half = (length_m / 2.0 * math.cos(angle), length_m / 2.0 * math.sin(angle))
     return Screen(name, (x - half[0], y - half[1]), (x + half[0], y + half[1]))

@@ -7,12 +7,12 @@ channel model. The receiver model is in `simulation.radio`.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.types.columns import Columns
 
 SPEED_OF_LIGHT_M_PER_NS = 0.299792458
 
@@ -138,7 +138,7 @@ OUTDOOR_LOS = Environment("outdoor LOS", 45.6, 1.76, 0.83, 0.12, 6.0, 0.0048, (0
 
 
 @dataclass(frozen=True, slots=True)
-class DiffuseField:
+class DiffuseField(Columns):
     """Delays and mean powers of the rays of n placements; they change over metres.
 
     Attributes:
@@ -154,10 +154,6 @@ class DiffuseField:
     nakagami_m: NDArray[np.float64]
     shadowing_db: NDArray[np.float64]
     pattern_loss_db: NDArray[np.float64]
-
-    def take(self, index: NDArray[np.intp]) -> DiffuseField:
-        """Return the placements at `index`, in that order."""
-        return DiffuseField(*(getattr(self, field.name)[index] for field in fields(self)))
 
     def moved(
         self, end: DiffuseField, progress: NDArray[np.float64], changes_at: NDArray[np.float64]
@@ -261,47 +257,3 @@ def direct_power_db(
 ) -> NDArray[np.float64]:
     """Return the power of the direct path relative to the transmit power, dB: Friis minus obstacle loss."""
     return -channel.free_space_loss_1m_db - 20.0 * np.log10(distance_m) - loss_db
-
-
-def propagate(
-    distance_m: NDArray[np.float64],
-    loss_db: NDArray[np.float64],
-    excess_m: NDArray[np.float64],
-    environment: Environment,
-    field: DiffuseField,
-    fading: NDArray[np.complex128],
-    channel: Channel,
-    rng: np.random.Generator,
-) -> Multipath:
-    """Join the direct path and the diffuse field of n pairs.
-
-    For LOS, the environment's path loss gives the power of all paths, so the diffuse field has this power minus
-    that of the direct path, but at least a twentieth (at short distances the direct path can have all of it). For
-    NLOS, the environment's path loss is that of the diffuse field itself.
-
-    Args:
-        distance_m: straight-line distance, float64 (n,).
-        loss_db: loss of the direct path (`simulation.scene`), float64 (n,).
-        excess_m: extra optical length of the direct path, float64 (n,).
-        environment: environment of all pairs.
-        field: diffuse fields of n pairs; see `draw_diffuse_field`.
-        fading: gains of the rays, complex128 (n, rays).
-        channel: UWB channel.
-        rng: source of the phase of the direct path.
-
-    Raises:
-        ParameterError: a distance is not finite and positive.
-    """
-    if not bool(np.all(np.isfinite(distance_m) & (distance_m > 0))):
-        raise ParameterError("distance that is not finite and positive", where="channel", valid="> 0 m")
-    direct = 10.0 ** (direct_power_db(distance_m, loss_db + field.pattern_loss_db, channel) / 10.0)
-    diffuse = 10.0 ** (-environment.path_loss_db(distance_m, channel) / 10.0)
-    if environment.first_cluster_delay_ns == 0.0:
-        diffuse = np.maximum(diffuse - direct, 0.05 * diffuse)
-    diffuse = diffuse * 10.0 ** (field.shadowing_db / 10.0)
-    phase = rng.uniform(0.0, 2.0 * math.pi, len(distance_m))
-    gain = np.concatenate(
-        [(np.sqrt(direct) * np.exp(1j * phase))[:, None], np.sqrt(diffuse)[:, None] * fading], axis=1
-    )
-    delay = np.concatenate([(excess_m / SPEED_OF_LIGHT_M_PER_NS)[:, None], field.delay_ns], axis=1)
-    return Multipath(delay, gain)

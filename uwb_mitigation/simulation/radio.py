@@ -8,13 +8,14 @@ were fitted to the EVK1000 logs, and the quality of the fit. `DW3000_STS` is a v
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.simulation.channel import CHANNEL_2, SPEED_OF_LIGHT_M_PER_NS, Channel, Multipath
+from uwb_mitigation.types.columns import Columns
 from uwb_mitigation.types.measurement import SAMPLE_PERIOD_S, RadioType, Segment
 
 TAPS = 1016
@@ -106,7 +107,7 @@ class Reception:
 
 
 @dataclass(frozen=True, slots=True)
-class Boards:
+class Boards(Columns):
     """Board properties of n pairs (both ends) that differ between boards with the same chip: float64 (n,) each.
 
     Attributes:
@@ -119,10 +120,6 @@ class Boards:
     preamble_symbols: NDArray[np.float64]
     self_noise_db: NDArray[np.float64]
     noise_multiplier: NDArray[np.float64]
-
-    def take(self, index: NDArray[np.intp]) -> Boards:
-        """Return the pairs at `index`, in that order."""
-        return Boards(*(getattr(self, field.name)[index] for field in fields(self)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,13 +7,13 @@ and the path is diffracted around its nearer edge.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.simulation.channel import CHANNEL_2, Channel
+from uwb_mitigation.types.columns import Columns
 
 Point = tuple[float, float]
 
@@ -62,7 +62,7 @@ class Screen:
 
 
 @dataclass(frozen=True, slots=True)
-class DirectPath:
+class DirectPath(Columns):
     """Effects of obstacles on n direct paths on a UWB channel, arrays of shape (n,).
 
     Contains the loss in dB and the extra optical length in m as float64, and the number of crossed obstacles as int64.
@@ -72,16 +72,6 @@ class DirectPath:
     excess_m: NDArray[np.float64]
     crossings: NDArray[np.int64]
     channel: Channel
-
-    def take(self, index: NDArray[np.intp]) -> DirectPath:
-        """Return the paths at `index`, in that order."""
-        return DirectPath(self.loss_db[index], self.excess_m[index], self.crossings[index], self.channel)
-
-    @classmethod
-    def joined(cls, paths: Sequence[DirectPath]) -> DirectPath:
-        """Concatenate `paths`, one or more, on the same channel."""
-        loss, excess, crossings = zip(*((p.loss_db, p.excess_m, p.crossings) for p in paths), strict=True)
-        return cls(np.concatenate(loss), np.concatenate(excess), np.concatenate(crossings), paths[0].channel)
 
 
 @dataclass(frozen=True, slots=True)

@@ -46,7 +46,7 @@ ranges then stay similar over about a metre, as in the Hanyang recordings (docs/
 ROBOT_FRAME = "base_link"
 """Frame of the ranges of a robot: its antenna is at its origin."""
 
-FIRST_TAG_ID = 101
+TAG_ID = 101
 NOT_RECEIVED = "frame too weak to be received"
 
 PLACEMENTS_RATE_HZ = 20.0
@@ -54,11 +54,10 @@ PLACEMENTS_RATE_HZ = 20.0
 
 @dataclass(frozen=True, slots=True)
 class TwrBatch:
-    """n exchanges before the radio model: their numbers, ids, configurations and pairs, and headings of moving tags."""
+    """n exchanges before the radio model: their numbers, anchors, configurations and pairs, and headings of moving tags."""
 
     sequence: NDArray[np.int64]
     anchor_id: NDArray[np.int64]
-    tag_id: NDArray[np.int64]
     configuration: list[str]
     pairs: AntennaPairs
     boards: Boards | None = None
@@ -102,7 +101,7 @@ class Simulated(Source):
             anchor_id = int(exchanges.anchor_id[i])
             measurement = RangeMeasurement(
                 stamp_ns=stamp_ns,
-                tag_id=int(exchanges.tag_id[i]),
+                tag_id=TAG_ID,
                 anchor_id=anchor_id,
                 sequence=sequence & 0xFFFFFFFF,
                 device_time=round(stamp_ns * DEVICE_TICK_HZ / 1e9) % DEVICE_TIME_WRAP,
@@ -118,7 +117,7 @@ class Simulated(Source):
 
 
 class SimulatedSource(Simulated):
-    """Tags on a robot's route through a flat, ranging to fixed anchors in turn; a `Source`.
+    """A tag on a robot's route through a flat, ranging to fixed anchors in turn; a `Source`.
 
     Every two metres of the route are a separate configuration for each pair, "simulated seed 1/tag 101/
     anchor 3/segment 7". The diffuse field of each pair changes continuously, and the fading with each exchange:
@@ -129,7 +128,6 @@ class SimulatedSource(Simulated):
         count: exchanges to simulate; 0 = endless. An exchange below the sensitivity is not yielded but
             counted in `skipped`.
         rate_hz: exchanges per second over all pairs, 0.1 to 100000.
-        tags: 1 to 64, spread evenly along the route.
         anchors: positions in m; their identities are 1, 2, ... in this order.
         plan, radio, route: the scene, the receiver, the closed route (m).
         environments: diffuse fields.
@@ -148,7 +146,6 @@ class SimulatedSource(Simulated):
         seed: int = 1,
         count: int = 0,
         rate_hz: float = 20.0,
-        tags: int = 1,
         anchors: tuple[Point, ...] = ANCHORS,
         plan: Building = FLAT,
         radio: Receiver | None = None,
@@ -158,20 +155,16 @@ class SimulatedSource(Simulated):
     ) -> None:
         check_seed(seed)
         check_range("simulated source", "count", count, 0, 2**40, whole=True)
-        check_range("simulated source", "tags", tags, 1, 64, whole=True)
         _check_positions("anchors", anchors, 1, 64)
         _check_positions("route", route, 3, 10_000)
         super().__init__(f"simulated flat, seed {seed}", rate_hz, radio or Receiver(), count)
         self._plan = plan
         self._seed = seed
-        self._tags = tags
         self._anchors = np.asarray(anchors, np.float64)
         self.anchors = AnchorMap([Anchor(n, (x, y, 0.0)) for n, (x, y) in enumerate(anchors, 1)])
         self._route = route
         self._environments = environments
         self._gains_db = np.broadcast_to(np.asarray(gains_db, np.float64), len(anchors))
-        closed = np.asarray([*route, route[0]])
-        self._spacing_m = float(np.hypot(*np.diff(closed, axis=0).T).sum()) / tags
 
     @classmethod
     def with_anchors(
@@ -188,9 +181,8 @@ class SimulatedSource(Simulated):
         return cls(seed=seed, count=count, rate_hz=rate_hz, anchors=anchors[:number], radio=radio)
 
     def _batches(self) -> Iterator[tuple[TwrBatch, np.random.Generator]]:
-        pairs = self._tags * len(self._anchors)
         generators = (np.random.default_rng([self._seed, segment, 0]) for segment in counting())
-        knots = ((draw_fields(self._environments, pairs, rng), rng) for rng in generators)
+        knots = ((draw_fields(self._environments, len(self._anchors), rng), rng) for rng in generators)
         for segment, ((fields, rng), (next_fields, _)) in enumerate(pairwise(knots)):
             first, stop = (math.ceil(s * SEGMENT_S * self._rate_hz) for s in (segment, segment + 1))
             if self._count and first >= self._count:
@@ -208,28 +200,25 @@ class SimulatedSource(Simulated):
         self, sequence: NDArray[np.int64], segment: int, fields: tuple[DiffuseField, DiffuseField]
     ) -> TwrBatch:
         anchor = sequence % len(self._anchors)
-        tag = sequence // len(self._anchors) % self._tags
-        travelled = SPEED_M_PER_S * sequence / self._rate_hz + tag * self._spacing_m
-        tag_id, anchor_id = FIRST_TAG_ID + tag, 1 + anchor
+        travelled = np.asarray(SPEED_M_PER_S * sequence / self._rate_hz, np.float64)
+        anchor_id = 1 + anchor
         names = [
-            f"simulated seed {self._seed}/tag {t}/anchor {a}/segment {segment}"
-            for t, a in zip(tag_id.tolist(), anchor_id.tolist(), strict=True)
+            f"simulated seed {self._seed}/tag {TAG_ID}/anchor {number}/segment {segment}"
+            for number in anchor_id.tolist()
         ]
-        pair = tag * len(self._anchors) + anchor
         anchors, positions = self._anchors[anchor], along_route(self._route, travelled)
         path = self._plan.direct_path(anchors, positions, self._radio.channel)
         return TwrBatch(
             sequence,
             anchor_id,
-            tag_id,
             names,
-            AntennaPairs(anchors, positions, path, self._environments, fields, pair, stationary=False),
-            replace(self._radio.boards(len(pair)), gain_db=self._gains_db[anchor]),
+            AntennaPairs(anchors, positions, path, self._environments, fields, anchor, stationary=False),
+            replace(self._radio.boards(len(anchor)), gain_db=self._gains_db[anchor]),
             tag_yaw=yaw_along_route(self._route, travelled),
         )
 
     def motion(self) -> SimulatedMotion:
-        """Return odometry and IMU data of the robot with the first tag, for the duration of a source with a `count`."""
+        """Return odometry and IMU data of the robot with the tag, for the duration of a source with a `count`."""
         return simulate_motion(self._route, SPEED_M_PER_S, self._count / self._rate_hz, self._seed)
 
 
@@ -272,11 +261,9 @@ class SimulatedBuildings(Simulated):
     def _exchange(self, block: Block, rows: NDArray[np.intp], first: int, names: list[str]) -> TwrBatch:
         """Return the exchanges of some placements; `first`: number of the first of them among all placements."""
         index = np.repeat(np.arange(len(rows)), self._exchanges)
-        ids = np.ones(len(index), np.int64)
         return TwrBatch(
             first * self._exchanges + np.arange(len(index)),
-            ids,
-            FIRST_TAG_ID * ids,
+            np.ones(len(index), np.int64),
             [names[k] for k in index.tolist()],
             block.pairs.take(rows, index),
             block.boards.take(rows[index]),

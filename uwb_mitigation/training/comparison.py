@@ -184,20 +184,20 @@ def _hold_out(
             integers = quantise_network(network, calibration_inputs(train_data, seed), exact=False)
             outputs.append(("shipped_int8", IntegerNetwork(integers).predict_m(test.inputs)))
         for name, output in outputs:
-            corrections = zero_shot.correct_with_card(test, card, (linear_bias + output).astype(np.float32))
-            errors[name][fold.test] -= corrections.correction_m
-        variance[fold.test] = corrections.variance_m2
+            predicted_m = (linear_bias + output).astype(np.float32)
+            correction_m, *others = zero_shot.correct_with_card(test, card, predicted_m)
+            errors[name][fold.test] -= correction_m
+        variance[fold.test], passed_through[fold.test] = others
         sigmas95[fold.test] = card.interval95_sigmas
-        passed_through[fold.test] = corrections.passed_through
         on_fold()
     return HeldOut(errors, variance, sigmas95, passed_through)
 
 
 def _baselines(
     train_data: Dataset, test: Dataset, recipe: Recipe, seed: int
-) -> Iterator[tuple[str, NDArray[np.floating]]]:
-    yield "los_median", baselines.los_median(train_data)(test)
-    yield "overall_median", baselines.overall_median(train_data)(test)
+) -> Iterator[tuple[str, NDArray[np.floating] | float]]:
+    yield "los_median", baselines.los_median(train_data)
+    yield "overall_median", baselines.overall_median(train_data)
     yield "l1_line", linear_bias_m(candidates.fit_line(train_data), test)
     if not test.has_cirs:
         return

@@ -9,7 +9,7 @@ from __future__ import annotations
 import enum
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import Any
 
@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.types.columns import Columns
 
 DEVICE_TICK_HZ = 128 * 499.2e6
 """Rate of the DW1000's timestamp counter (DW1000 user manual, section 2.5.8: 1 / 15.65 ps)."""
@@ -344,7 +345,7 @@ _CIR_NUMBERS = attrgetter(
 
 # Not frozen, because this takes 1 % of the time of a correction.
 @dataclass(slots=True, eq=False)
-class RangeColumns:
+class RangeColumns(Columns):
     """Columns of n exchanges whose CIRs have the same encoding, length, radio, segment and channel: inputs of the correction.
 
     Attributes:
@@ -393,14 +394,6 @@ class RangeColumns:
             columns.channel = cirs[0].channel
             yield indices, columns
 
-    def take(self, rows: list[int]) -> RangeColumns:
-        """Return the selected exchanges."""
-        columns: dict[str, Any] = {
-            name: value[rows] if isinstance(value := getattr(self, name), np.ndarray) else value
-            for name in self.__slots__
-        }
-        return RangeColumns(**columns)
-
     def __len__(self) -> int:
         """The number of exchanges."""
         return len(self.range_m)
@@ -429,7 +422,7 @@ def is_logarithmic(magnitudes: NDArray[Any]) -> NDArray[np.bool_]:
 
 # Not frozen, because this takes 1 % of the time of a correction.
 @dataclass(slots=True, eq=False)
-class CorrectedColumns:
+class CorrectedColumns(Columns):
     """Columns of n corrected ranges of one origin; the fields are those of `CorrectedRange`.
 
     Attributes:
@@ -454,13 +447,6 @@ class CorrectedColumns:
         """Why each range was not corrected, text (n,); empty: it was."""
         columns = (self.status, self.fault, self.range_m + self.correction_m, self.correction_m)
         return np.array([reason(*row) for row in zip(*(c.tolist() for c in columns), strict=True)], np.str_)
-
-    @classmethod
-    def joined(cls, chunks: Sequence[CorrectedColumns]) -> CorrectedColumns:
-        """Concatenate ranges of one origin."""
-        names = [column.name for column in fields(cls) if column.name != "origin"]
-        columns: Any = {name: np.concatenate([getattr(chunk, name) for chunk in chunks]) for name in names}
-        return cls(origin=chunks[0].origin, **columns)
 
     def __len__(self) -> int:
         """The number of ranges."""

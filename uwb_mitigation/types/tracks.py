@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
+from uwb_mitigation.types.columns import Columns
 from uwb_mitigation.types.stamps import NS_PER_S
 
 _Series = TypeVar("_Series", bound="TimeSeries")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TimeSeries:
+class TimeSeries(Columns):
     """Base of classes with n rows in the order of their times: arrays (n, ...).
 
     Attributes:
@@ -30,12 +31,6 @@ class TimeSeries:
 
     def __len__(self) -> int:
         return len(self.stamp_ns)
-
-    def take(self: _Series, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> _Series:
-        """Return the rows at `index`."""
-        columns = {column_field.name: getattr(self, column_field.name) for column_field in fields(self)}
-        selected = {name: column[index] for name, column in columns.items() if isinstance(column, np.ndarray)}
-        return replace(self, **selected)
 
     def reversed(self: _Series, end_ns: int) -> _Series:
         """Return the rows backwards in time, from `end_ns` on."""
@@ -67,13 +62,12 @@ class Ranges(TimeSeries):
     tag_id: int = 0
     is_corrected: NDArray[np.bool_] | bool = False
 
-    @classmethod
-    def joined(cls, groups: Sequence[Ranges]) -> Ranges:
-        """Concatenate ranges; the tag id is 0."""
-        names = ("stamp_ns", "anchor", "range_m", "variance_m2", "rx_power_dbm")
-        columns: Any = (np.concatenate([getattr(group, name) for group in groups]) for name in names)
-        is_corrected = [np.broadcast_to(group.is_corrected, len(group)) for group in groups]
-        return replace(cls(*columns), is_corrected=np.concatenate(is_corrected))
+    @staticmethod
+    def of_tags(tags: Sequence[Ranges]) -> Ranges:
+        """Concatenate the ranges of tags; the tag id is 0."""
+        flags = (np.broadcast_to(ranges.is_corrected, len(ranges)) for ranges in tags)
+        rows = [replace(ranges, is_corrected=flag) for ranges, flag in zip(tags, flags, strict=True)]
+        return replace(Ranges.joined(rows), tag_id=0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -337,12 +331,11 @@ class PosePath(TimeSeries):
         position[solvable] = np.linalg.solve(normal[solvable], right[solvable])[:, 0]
         return PosePath(self.stamp_ns, position, self.orientation)
 
-    @classmethod
-    def joined(cls, paths: Sequence[PosePath]) -> PosePath:
+    @staticmethod
+    def merged(paths: Sequence[PosePath]) -> PosePath:
         """Return all poses in the order of time."""
-        stamp_ns = np.concatenate([path.stamp_ns for path in paths])
-        columns = (np.concatenate([getattr(path, name) for path in paths]) for name in cls.__slots__)
-        return cls(stamp_ns, *columns).take(np.argsort(stamp_ns, kind="stable"))
+        poses = PosePath.joined(paths)
+        return poses.take(np.argsort(poses.stamp_ns, kind="stable"))
 
     def interpolated(self, stamp_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], Rotation]:
         """Return positions (k, 3) and rotations (k,) at stamps; outside, those of the first or last pose.

@@ -26,7 +26,6 @@ from uwb_mitigation.mitigation.embedded.compiling import (
 from uwb_mitigation.radios.settings import RadioSettings, RadioStatus
 from uwb_mitigation.radios.wire import messages
 from uwb_mitigation.radios.wire.layout import MAX_PAYLOAD_BYTES, MessageType, Mode
-from uwb_mitigation.radios.wire.messages import SetRadio
 
 NOMINAL_DELAY_TICKS = 16436
 """Antenna delay of a chip's transmitter, and of its receiver."""
@@ -107,7 +106,7 @@ class ModelledAir:
         Without a serial link, the board only ranges.
         """
         settings.check()
-        _, payload = messages.encode(SetRadio(settings))
+        _, payload = messages.encode(settings)
         board: int = self._library.radio_air_add_board(
             self._air,
             ppm,

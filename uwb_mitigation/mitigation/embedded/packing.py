@@ -104,17 +104,16 @@ def pack(weights: Int8Weights) -> PackedNetwork:
 def _packed_convolutions(weights: Int8Weights, shape: Remnet) -> dict[str, Any]:
     """Return the fields of `PackedNetwork` that only a REMNet has, and the head."""
     _check_shape(shape)
-    scale = weights.activation_scale
+    scale, inputs = weights.activation_scale, inputs_of(shape)
 
-    def total(name: str, first: str, second: str) -> Sum:
-        exact = solve_sum(np.float32(scale[first] / scale[name]), np.float32(scale[second] / scale[name]))
+    def total(name: str) -> Sum:
+        exact = solve_sum(*(np.float32(scale[operand] / scale[name]) for operand in inputs[name]))
         if exact is None:
             raise ModelError("the sum has no exact integer form", where=name, valid=_REMEDY)
         return exact
 
     first = np.pad(weights.weight["first"][:, 0], ((0, 0), (0, 1))).astype(np.int16)
     modules = []
-    tensor = "first"
     for number in range(1, shape.modules + 1):
         name = f"module{number}"
         reduce = weights.weight[f"{name}.reduce"]
@@ -125,14 +124,13 @@ def _packed_convolutions(weights: Int8Weights, shape: Remnet) -> dict[str, Any]:
             PackedModule(
                 _packed_taps(f"{name}.residual", weights.weight[f"{name}.residual"]),
                 _channels(weights, f"{name}.residual"),
-                total(f"{name}.sum", f"{name}.residual", tensor),
+                total(f"{name}.sum"),
                 _channel_pairs(taps).astype(np.int16).reshape(-1),
                 _channels(weights, f"{name}.reduce"),
                 _channels(weights, f"{name}.skip"),
-                total(name, f"{name}.reduce", f"{name}.skip"),
+                total(name),
             )
         )
-        tensor = name
     return {
         "head_weights": _head_words(_head_in_blocks(weights.weight[HEAD], shape)),
         "first_kernel": shape.first_kernel,

@@ -17,7 +17,7 @@ from uwb_mitigation.radios.dw1000.bus import Bus
 from uwb_mitigation.radios.settings import STATE_PROBLEMS, RadioSettings, RadioStatus
 from uwb_mitigation.radios.wire import messages
 from uwb_mitigation.radios.wire.layout import MAX_PAYLOAD_BYTES, MessageType
-from uwb_mitigation.radios.wire.messages import RadioConfigured, SetRadio
+from uwb_mitigation.radios.wire.messages import RadioConfigured
 from uwb_mitigation.types.measurement import RangeMeasurement
 
 _OPTIONS = ("-std=c99", "-O2", "-fPIC", *compiling.WARNINGS)
@@ -140,7 +140,7 @@ class NativeRadio:
     def _encoded(self, settings: RadioSettings) -> tuple[bytes, int, int, int]:
         """Return a payload of SET_RADIO, its size, and the default times of a tag on this bus."""
         settings.check()
-        _, payload = messages.encode(SetRadio(settings))
+        _, payload = messages.encode(settings)
         return payload, len(payload), self._bus.reply_us, self._bus.timeout_us
 
     def _decoded(self, kind: MessageType, write: Callable[..., int]) -> Any:

@@ -106,10 +106,11 @@ class Calibration:
 
     Args:
         originals: stores the original values; None = they are only kept while the object exists.
+        counts: `calibration_writes` is increased.
     """
 
-    def __init__(self, originals: OriginalsFile | None) -> None:
-        self._originals = originals
+    def __init__(self, originals: OriginalsFile | None, counts: Counter[str]) -> None:
+        self._originals, self._counts = originals, counts
         self._board: str | None = None
         self._changes: Changes = {}
         self._results: dict[tuple[str, int], int | None] = {}
@@ -121,9 +122,7 @@ class Calibration:
             self._board, self._results = board, {}
             self._changes = self._originals.load(board) if self._originals is not None else {}
 
-    def set_window(
-        self, taps: int, counts: Counter[str]
-    ) -> Generator[Command, Packet | None, tuple[int, int] | None]:
+    def set_window(self, taps: int) -> Generator[Command, Packet | None, tuple[int, int] | None]:
         """Request a window; return the taps and the lead that the board has, None = unknown.
 
         A board that refuses keeps its own window: the CIR contains its size.
@@ -145,7 +144,7 @@ class Calibration:
                 self._changes[key] = original, [*written, value]
             self._save()
             before = values
-            yield from self._write(different, size, counts)
+            yield from self._write(different, size)
             values = yield from self._read(requested)
             for key in different:
                 self._changes[key][1].append(values.get(key, before[key]))
@@ -156,7 +155,7 @@ class Calibration:
         self._save()
         return (values[TAPS], values.get(LEAD, WINDOW_LEAD)) if TAPS in values else None
 
-    def restore(self, counts: Counter[str]) -> Generator[Command, Packet | None, None]:
+    def restore(self) -> Generator[Command, Packet | None, None]:
         """Write the original values of the keys that were changed, unless another program has changed them."""
         values = (yield from self._read(self._changes)) if self._changes else {}
         originals = {
@@ -164,7 +163,7 @@ class Calibration:
             for key, (original, written) in self._changes.items()
             if values.get(key, original) != original and values[key] in written
         }
-        answered = yield from self._write(originals, self._count_sizes[0], counts)
+        answered = yield from self._write(originals, self._count_sizes[0])
         if answered and values.keys() >= self._changes.keys():
             self._changes = {}
             self._save()
@@ -177,13 +176,11 @@ class Calibration:
         answer = yield Command(codes.GET_CALIBRATION, messages.get_calibration(list(keys)), tries=2)
         return messages.calibration_values(answer.payload) if answer is not None else {}
 
-    def _write(
-        self, values: Mapping[str, int], count_size: int, counts: Counter[str]
-    ) -> Generator[Command, Packet | None, bool]:
+    def _write(self, values: Mapping[str, int], count_size: int) -> Generator[Command, Packet | None, bool]:
         """Return whether the board has answered all commands."""
         answers = []
         for key, value in values.items():
-            counts["calibration_writes"] += 1
+            self._counts["calibration_writes"] += 1
             payload = messages.set_calibration(key, value, count_size)
             answers.append((yield Command(codes.SET_CALIBRATION, payload, tries=1)))
         return None not in answers

@@ -6,7 +6,6 @@ Sources: FiRa UCI, as implemented by public hosts; the parameters of Qorvo's fir
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
 
 
 class PacketType(enum.IntEnum):
@@ -57,43 +56,26 @@ class SessionState(enum.IntEnum):
     IDLE = 3
 
 
-@dataclass(frozen=True, slots=True)
-class ExchangeCause:
-    """Why an exchange has no range.
-
-    Attributes:
-        name: in words.
-        remedy: what to do.
-        unexpected: it does not occur because a board is out of range.
-    """
-
-    name: str
-    remedy: str
-    unexpected: bool = False
-
-
-EXCHANGE_CAUSES = {
-    0x1B: ExchangeCause(
-        "negative distance", "the boards are closer than 1 m, or their antenna delay is not calibrated", True
-    ),
-    0x20: ExchangeCause(
-        "transmission failed", "load the calibration of the board again, as after a chip erase", True
-    ),
-    0x21: ExchangeCause(
-        "reception timeout",
-        "are the other boards on, with the same channel, addresses, session id and interval?",
-    ),
-    0x22: ExchangeCause("PHY decoding error", "the signal is weak, or other radios use the channel"),
-    0x23: ExchangeCause("no time of arrival", "the signal is weak, or other radios use the channel"),
-    0x24: ExchangeCause("STS error", "the boards need the same STS and preamble code; or the signal is weak"),
+EXCHANGE_REMEDIES = {
+    "negative distance": "the boards are closer than 1 m, or their antenna delay is not calibrated",
+    "transmission failed": "load the calibration of the board again, as after a chip erase",
+    "reception timeout": "are the other boards on, with the same channel, addresses, session id and interval?",
+    "PHY decoding error": "the signal is weak, or other radios use the channel",
+    "no time of arrival": "the signal is weak, or other radios use the channel",
+    "STS error": "the boards need the same STS and preamble code; or the signal is weak",
 }
+"""{cause of an exchange without a range: what to do}."""
+
+UNEXPECTED_CAUSES = ("negative distance", "transmission failed")
+"""Causes that do not occur because a board is out of range."""
+
+EXCHANGE_CAUSES = dict(zip((0x1B, *range(0x20, 0x25)), EXCHANGE_REMEDIES, strict=True))
 """{status of a range: cause}."""
 
 
 def exchange_cause(status: int) -> str:
     """Return the cause of a failed exchange in words."""
-    cause = EXCHANGE_CAUSES.get(status)
-    return cause.name if cause is not None else f"status 0x{status:02x}"
+    return EXCHANGE_CAUSES.get(status, f"status 0x{status:02x}")
 
 
 _STATUS_TEXTS = (

@@ -40,14 +40,13 @@ class Packet:
     """A response or notification, assembled from its fragments.
 
     Attributes:
-        kind, group, opcode: from the header.
+        kind, name: from the header; `name` consists of group and opcode.
         payload: of all fragments.
         content: the parsed content of ranges and diagnostics.
     """
 
     kind: PacketType
-    group: int
-    opcode: int
+    name: tuple[int, int]
     payload: bytes
     content: RangeNotification | Diagnostics | None = None
 
@@ -195,5 +194,5 @@ def _parsed(name: tuple[int, int, int], payload: bytes) -> Packet | None:
             content = messages.parse_ranges(payload)
         elif name == _DIAGNOSTICS:
             content = messages.parse_diagnostics(payload)
-        return Packet(PacketType(name[0]), name[1], name[2], payload, content)
+        return Packet(PacketType(name[0]), name[1:], payload, content)
     return None

@@ -80,7 +80,7 @@ class UciSession(Session):
         self.assembly = Assembly(self.ranging, self.counts)
         self._decoder = PacketDecoder()
         self._commands = CommandSequence(self._finish, self._outgoing)
-        self._calibration = Calibration(originals)
+        self._calibration = Calibration(originals, self.counts)
         self._identifies = originals is not None
         self._ready = self._stopping = self._state_requested = False
         self._restart_ns: int | None = None
@@ -186,13 +186,13 @@ class UciSession(Session):
             self.device_info = answer.payload[1:] if answer and answer.status == STATUS_OK else b""
             self._calibration.connected(self.device_info.hex())
         if self.settings.window:
-            self.window = yield from self._calibration.set_window(self.settings.window, self.counts)
+            self.window = yield from self._calibration.set_window(self.settings.window)
         self.assembly.begin()
         return (yield from self.ranging.open_all())
 
     def _shut_down(self) -> Steps:
         yield from self.ranging.close_all()
-        yield from self._calibration.restore(self.counts)
+        yield from self._calibration.restore()
         return _NOT_CONNECTED
 
     def _finish(self, problem: str, now_ns: int) -> None:
@@ -237,7 +237,7 @@ class UciSession(Session):
             self._begin(now_ns)
 
     def _handle(self, packet: Packet, now_ns: int, stamp_ns: int) -> None:
-        name, command = (packet.group, packet.opcode), self._commands.command
+        name, command = packet.name, self._commands.command
         if command is None:
             self._received_ns = now_ns
             self._state_requested = False

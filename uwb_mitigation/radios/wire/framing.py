@@ -124,35 +124,32 @@ class FrameDecoder:
             segments[0] = self._tail + segments[0]
         tail = segments.pop()
         for segment in segments:
-            frame = self._decode(segment) if segment else None
-            if frame is not None:
+            frame = self._decode(segment) if segment else ""
+            if isinstance(frame, WireFrame):
                 frames.append(frame)
+            elif frame:
+                counts[frame] += 1
         if len(tail) > MAX_ENCODED_BYTES:
             counts["oversize"] += 1
             self._overrun = True
             tail = b""
         self._tail = tail
 
-    def _decode(self, segment: bytes) -> WireFrame | None:
-        counts = self.counts
+    def _decode(self, segment: bytes) -> WireFrame | str:
+        """Return a frame, or the name of the count of a segment that is none."""
         if len(segment) > MAX_ENCODED_BYTES:
-            counts["oversize"] += 1
-            return None
+            return "oversize"
         try:
             body = cobs.decode(segment)
         except cobs.DecodeError:
-            counts["bad_cobs"] += 1
-            return None
+            return "bad_cobs"
         if not _MIN_FRAME_BYTES <= len(body) <= layout.MAX_FRAME_BYTES:
-            counts["bad_length"] += 1
-            return None
+            return "bad_length"
         if zlib.crc32(body) != _CRC_RESIDUE:
-            counts["bad_crc"] += 1
-            return None
+            return "bad_crc"
         version, kind, flags, sequence, time_us = _header.unpack_from(body)
         if version != PROTOCOL_VERSION:
-            counts["foreign_version"] += 1
             self.last_foreign_version = version
-            return None
-        counts["frames"] += 1
+            return "foreign_version"
+        self.counts["frames"] += 1
         return WireFrame(kind, flags, sequence, time_us, body[HEADER_BYTES:-CRC_BYTES])

@@ -134,36 +134,20 @@ class RadioConfigured:
 
 @dataclass(frozen=True, slots=True)
 class OffsetsAnswer:
-    """The answer to a `SetOffsets`; the fields of `layout.PAYLOADS[OFFSETS]`."""
+    """The answer to requested `Offsets`; the fields of `layout.PAYLOADS[OFFSETS]`."""
 
     request_sequence: int
     slots: int
     accepted: bool
 
 
-@dataclass(frozen=True, slots=True)
-class SetMode:
-    """Requests a mode; the board answers with a HELLO that contains the active mode."""
-
-    mode: Mode
-
-
-@dataclass(frozen=True, slots=True)
-class SetRadio:
-    """Requests settings; the board answers with a RADIO that accepts or refuses them."""
-
-    settings: RadioSettings
-
-
-@dataclass(frozen=True, slots=True)
-class SetOffsets:
-    """Requests that the board subtracts these offsets from its ranges; it answers with an `OffsetsAnswer`."""
-
-    offsets: Offsets
-
-
 Message = object
-"""An object of a type in `_ENCODERS`, or the `MessageType` of a request without content: GET_INFO, TIME_SYNC, GET_RADIO."""
+"""An object of a type in `_ENCODERS`, or the `MessageType` of a request without content: GET_INFO, TIME_SYNC, GET_RADIO.
+
+Other requests are the requested values themselves. A board answers a `Mode` with a HELLO that contains the active mode,
+`RadioSettings` with a RADIO that accepts or refuses them, and `Offsets`, which it subtracts from its ranges, with an
+`OffsetsAnswer`.
+"""
 
 
 def encode(message: Message) -> tuple[MessageType, bytes]:
@@ -341,28 +325,23 @@ def _radio_status(values: tuple[Any, ...], payload: bytes, stamp_ns: int) -> Rad
     return RadioStatus(*fields)
 
 
-def _offsets_fields(m: SetOffsets) -> tuple[Any, ...]:
-    o = m.offsets
+def _offsets_fields(o: Offsets) -> tuple[Any, ...]:
     rows = [(tag, anchor, offset_m, OffsetScope.PAIR) for (tag, anchor), offset_m in o.pairs.items()]
     rows += [(0, anchor, offset_m, OffsetScope.ANCHOR) for anchor, offset_m in o.anchors.items()]
     rows += [(tag, 0, offset_m, OffsetScope.TAG) for tag, offset_m in o.tags.items()]
     return o.default, len(rows), b"".join(_OFFSET_ROW.pack(*row) for row in rows)
 
 
-def _offsets(values: tuple[Any, ...], payload: bytes, stamp_ns: int) -> SetOffsets:
-    anchors: dict[int, float] = {}
-    tags: dict[int, float] = {}
-    pairs: dict[tuple[int, int], float] = {}
-    for tag, anchor, offset_m, scope in _rows(
+def _offsets(values: tuple[Any, ...], payload: bytes, stamp_ns: int) -> Offsets:
+    by_scope: dict[OffsetScope, dict[Any, float]] = {scope: {} for scope in OffsetScope}
+    for tag, anchor, offset_m, number in _rows(
         _OFFSET_ROW, values[1], 0xFFFF, payload, MessageType.SET_OFFSETS
     ):
-        if _member(OffsetScope, scope) is OffsetScope.ANCHOR:
-            anchors.setdefault(anchor, offset_m)
-        elif scope == OffsetScope.TAG:
-            tags.setdefault(tag, offset_m)
-        else:
-            pairs.setdefault((tag, anchor), offset_m)
-    return SetOffsets(Offsets(default=values[0], anchors=anchors, tags=tags, pairs=pairs))
+        scope = _member(OffsetScope, number)
+        key = {OffsetScope.ANCHOR: anchor, OffsetScope.TAG: tag, OffsetScope.PAIR: (tag, anchor)}[scope]
+        by_scope[scope].setdefault(key, offset_m)
+    anchors, tags, pairs = by_scope.values()
+    return Offsets(values[0], anchors, tags, pairs)
 
 
 _ENCODERS: dict[type, tuple[MessageType, Callable[[Any], tuple[Any, ...]]]] = {
@@ -375,9 +354,9 @@ _ENCODERS: dict[type, tuple[MessageType, Callable[[Any], tuple[Any, ...]]]] = {
     RadioConfigured: (MessageType.RADIO, _radio_fields),
     RadioStatus: (MessageType.RADIO_STATUS, _radio_status_fields),
     OffsetsAnswer: (MessageType.OFFSETS, lambda m: (*astuple(m), b"")),
-    SetMode: (MessageType.SET_MODE, lambda m: (m.mode, b"")),
-    SetRadio: (MessageType.SET_RADIO, lambda m: _settings_fields(m.settings)),
-    SetOffsets: (MessageType.SET_OFFSETS, _offsets_fields),
+    Mode: (MessageType.SET_MODE, lambda mode: (mode, b"")),
+    RadioSettings: (MessageType.SET_RADIO, _settings_fields),
+    Offsets: (MessageType.SET_OFFSETS, _offsets_fields),
 }
 _DECODERS: dict[int, Callable[[tuple[Any, ...], bytes, int], Message]] = {
     MessageType.HELLO: _hello,
@@ -391,7 +370,7 @@ _DECODERS: dict[int, Callable[[tuple[Any, ...], bytes, int], Message]] = {
     MessageType.RADIO: _radio,
     MessageType.RADIO_STATUS: _radio_status,
     MessageType.OFFSETS: lambda v, *_: OffsetsAnswer(v[0], v[1], bool(v[2])),
-    MessageType.SET_MODE: lambda v, *_: SetMode(_member(Mode, v[0])),
-    MessageType.SET_RADIO: lambda v, payload, _: SetRadio(_settings(v, payload, MessageType.SET_RADIO)),
+    MessageType.SET_MODE: lambda v, *_: _member(Mode, v[0]),
+    MessageType.SET_RADIO: lambda v, payload, _: _settings(v, payload, MessageType.SET_RADIO),
     MessageType.SET_OFFSETS: _offsets,
 }

@@ -17,7 +17,7 @@ from uwb_mitigation.radios.wire.clock import DeviceClock
 from uwb_mitigation.radios.wire.events import Event, LinkState, Loss
 from uwb_mitigation.radios.wire.framing import FrameDecoder, FrameEncoder, WireFrame
 from uwb_mitigation.radios.wire.layout import PROTOCOL_VERSION, Flag, MessageType, Mode
-from uwb_mitigation.radios.wire.messages import Correction, Hello, RadioConfigured, SetOffsets, SetRadio
+from uwb_mitigation.radios.wire.messages import Correction, Hello, RadioConfigured
 from uwb_mitigation.types.measurement import RangeMeasurement
 from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets
 
@@ -158,7 +158,7 @@ class BoardSession(Session):
     def set_mode(self, mode: Mode) -> None:
         """Request `mode` until the board answers; a `PortMessage` follows."""
         self._mode = mode
-        self._mode_request.begin(messages.SetMode(mode))
+        self._mode_request.begin(mode)
         self._next_request_ns = 0
 
     def set_radio(self, settings: RadioSettings) -> None:
@@ -168,7 +168,7 @@ class BoardSession(Session):
             ParameterError: no radio has such settings.
         """
         settings.check()
-        self._radio_request.begin(SetRadio(settings))
+        self._radio_request.begin(settings)
         self._next_request_ns = 0
 
     def set_offsets(self, offsets: Offsets) -> None:
@@ -178,7 +178,7 @@ class BoardSession(Session):
         cannot use them, except for offsets of 0, which a board without offsets has anyway.
         """
         self._offsets_confirmed = False
-        self._offsets_request.begin(SetOffsets(offsets))
+        self._offsets_request.begin(offsets)
         self._next_request_ns = 0
 
     def receive(self, data: bytes, now_ns: int, stamp_ns: int) -> list[Event]:
@@ -273,9 +273,7 @@ class BoardSession(Session):
             self._consecutive_stale = 0
             self._num_syncs = 0
             self._next_sync_ns = now_ns
-            self._mode_request.repeat(
-                None if self._mode in (None, hello.mode) else messages.SetMode(self._mode)
-            )
+            self._mode_request.repeat(None if self._mode == hello.mode else self._mode)
             self._radio_request.repeat(self._radio_request.message)
             self._offsets_request.repeat(self._offsets_request.message)
             self._offsets_confirmed = False
@@ -292,7 +290,7 @@ class BoardSession(Session):
     @property
     def _offsets(self) -> Offsets:
         message = self._offsets_request.message
-        return message.offsets if isinstance(message, SetOffsets) else NO_OFFSETS
+        return message if isinstance(message, Offsets) else NO_OFFSETS
 
     def _send_request(self, request: _Request) -> bool:
         """Send a pending request; return True if it was given up after too many unanswered tries."""
@@ -322,17 +320,15 @@ class BoardSession(Session):
         return [radio]
 
     def _handle_correction(self, correction: Correction, answer: bool) -> list[Event]:
+        # This host never requests corrections from a board.
+        problem = "unsolicited" if answer else ""
         if not self.model_matches:
-            self.counts["wrong_model"] += 1
-            return []
-        if self._offsets and not self._offsets_confirmed:
-            self.counts["wrong_offsets"] += 1
-            return []
-        if answer:
-            # This host never requests corrections from a board.
-            self.counts["unsolicited"] += 1
-            return []
-        return [correction]
+            problem = "wrong_model"
+        elif self._offsets and not self._offsets_confirmed:
+            problem = "wrong_offsets"
+        if problem:
+            self.counts[problem] += 1
+        return [] if problem else [correction]
 
     def _handle_sync(self, reply: messages.TimeSyncReply, replied_us: int, stamp_ns: int) -> None:
         sent_ns = self._sync_send_times_ns.pop(reply.request_sequence, None)

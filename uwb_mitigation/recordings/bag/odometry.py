@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.recordings.bag.pose_paths import read_topic, sorted_rows
 from uwb_mitigation.recordings.bag.writer import BagWriter
-from uwb_mitigation.types.ros.poses import header_fields, quaternion, vector, yaw_of
+from uwb_mitigation.types.ros.poses import UNOBSERVED, header_fields, quaternion, vector, yaw_of
 from uwb_mitigation.types.ros.schemas import serialize
 from uwb_mitigation.types.ros.topics import IMU_TYPE, ODOMETRY_TYPE, ROBOT_IMU, ROBOT_ODOMETRY, TF, TF_TYPE
 from uwb_mitigation.types.stamps import to_ns
@@ -23,9 +23,6 @@ ODOM, BASE_LINK = "odom", "base_link"
 
 _PLANE = np.ix_([0, 1, 5], [0, 1, 5])
 """Rows and columns of x, y and yaw in a 6x6 covariance."""
-
-_UNMEASURED = 1e6
-"""Variance of values that wheels do not measure: z, roll and pitch."""
 
 
 def encode_odometry_row(odometry: Odometry, row: int) -> bytes:
@@ -49,8 +46,8 @@ def encode_imu_row(imu: Imu, row: int) -> bytes:
     orientation, turning, acceleration = np.zeros(9), np.zeros(9), np.zeros(9)
     orientation[0] = acceleration[0] = -1.0
     if math.isfinite(yaw):
-        orientation[[0, 4, 8]] = _UNMEASURED, _UNMEASURED, imu.yaw_variance[row]
-    turning[[0, 4, 8]] = _UNMEASURED, _UNMEASURED, imu.yaw_rate_variance[row]
+        orientation[[0, 4, 8]] = UNOBSERVED, UNOBSERVED, imu.yaw_variance[row]
+    turning[[0, 4, 8]] = UNOBSERVED, UNOBSERVED, imu.yaw_rate_variance[row]
     return serialize(
         IMU_TYPE,
         header=header_fields(int(imu.stamp_ns[row]), BASE_LINK),
@@ -147,6 +144,6 @@ def _columns(
 
 def _six(plane: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return a 6x6 covariance, flat, from that of x, y and yaw."""
-    covariance = np.diag(np.full(6, _UNMEASURED))
+    covariance = np.diag(np.full(6, UNOBSERVED))
     covariance[_PLANE] = plane
     return covariance.ravel()

@@ -23,7 +23,7 @@ from uwb_mitigation.files import read_bounded
 from uwb_mitigation.recordings.mapping.conversion import LOG_TIME, Chunk
 from uwb_mitigation.recordings.mapping.mapping import FILE, LIST_INDEX, TOPIC, VARIABLE, TableFormat
 from uwb_mitigation.recordings.mapping.messages import MAX_ROWS, MessageRows
-from uwb_mitigation.recordings.text_blocks import OnWarning, TextBlocks
+from uwb_mitigation.recordings.text_blocks import OnWarning, text_blocks
 
 CHUNK_ROWS, CHUNK_VALUES = 100_000, 4_000_000
 """Largest number of rows, and of values in columns, of a chunk."""
@@ -161,7 +161,7 @@ class TableFile:
 
     def text(self, quote: str = "") -> Iterator[str]:
         """Yield the text in blocks of complete lines, up to a damage."""
-        return self._up_to_damage(TextBlocks(self.path, self.on_warning, quote))
+        return self._up_to_damage(text_blocks(self.path, self.on_warning, quote))
 
     def choose(self, names: Sequence[str]) -> dict[str, str]:
         """Return {column: column of the file, also with other case}; raise RecordingError if a required one is missing."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import Any, NamedTuple
 
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.mitigation.early_path import MIN_RANGE_M, early_path_error_m
 from uwb_mitigation.mitigation.preprocessing import Preprocessing
+from uwb_mitigation.types.columns import Columns
 from uwb_mitigation.types.measurement import (
     Cir,
     CirFault,
@@ -30,7 +31,7 @@ _BATCH = 256
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Dataset:
+class Dataset(Columns):
     """Preprocessed measurements with true ranges; every array has n rows.
 
     Attributes:
@@ -77,21 +78,7 @@ class Dataset:
 
     def rows(self, selected: NDArray[np.intp] | NDArray[np.bool_]) -> Dataset:
         """Return a dataset with these rows."""
-        columns: dict[str, Any] = {name: values[selected] for name, values in self._columns().items()}
-        return replace(self, skipped={}, **columns)
-
-    @classmethod
-    def joined(cls, datasets: Sequence[Dataset]) -> Dataset:
-        """Concatenate parts with the same preprocessing; columns that a part does not have are left out."""
-        parts = [dataset._columns() for dataset in datasets]
-        names = [name for name in parts[0] if all(name in part for part in parts)]
-        columns: dict[str, Any] = {name: np.concatenate([part[name] for part in parts]) for name in names}
-        return cls(datasets[0].preprocessing, **columns)
-
-    def _columns(self) -> dict[str, NDArray[Any]]:
-        """Return the columns that the dataset has."""
-        values = {column.name: getattr(self, column.name) for column in fields(self)}
-        return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+        return replace(self.take(selected), skipped={})
 
     def with_early_paths(self, predicted_m: NDArray[np.floating]) -> NDArray[np.floating]:
         """Return the output of a network, (n,), m, with missed direct paths in place of it."""

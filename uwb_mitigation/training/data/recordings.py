@@ -9,7 +9,7 @@ from pathlib import Path
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
 from uwb_mitigation.recordings import formats
-from uwb_mitigation.recordings.truth_table import load_truth, with_truth
+from uwb_mitigation.recordings.csv_tables import load_truth, with_truth
 from uwb_mitigation.training.data import dataset as datasets
 from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.types.measurement import CirFault, Record, Truth

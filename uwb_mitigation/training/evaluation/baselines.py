@@ -24,15 +24,15 @@ _TINY = 1e-12
 Predict = Callable[[Dataset], NDArray[np.floating]]
 
 
-def los_median(train: Dataset) -> Predict:
-    """Predict the median error in LOS, or of all measurements if none has the label LOS."""
+def los_median(train: Dataset) -> float:
+    """Return the median error in LOS, or of all measurements if none has the label LOS, m."""
     los_errors = train.error_m[train.labels == LOS]
-    return _constant(float(np.median(los_errors if len(los_errors) else train.error_m)))
+    return float(np.median(los_errors if len(los_errors) else train.error_m))
 
 
-def overall_median(train: Dataset) -> Predict:
-    """Predict the median error."""
-    return _constant(float(np.median(train.error_m)))
+def overall_median(train: Dataset) -> float:
+    """Return the median error, m."""
+    return float(np.median(train.error_m))
 
 
 def ridge(train: Dataset, *, header: bool) -> Predict:
@@ -93,10 +93,6 @@ def baseline_features(dataset: Dataset, *, header: bool) -> NDArray[np.float64]:
         columns += [*headers.T.astype(np.float64), *np.log1p(headers.T.astype(np.float64))]
     result: NDArray[np.float64] = np.nan_to_num(np.column_stack(columns), nan=0.0, posinf=0.0, neginf=0.0)
     return result
-
-
-def _constant(value: float) -> Predict:
-    return lambda data: np.full(len(data), value)
 
 
 def _weights(train: Dataset) -> NDArray[np.float64]:

@@ -35,17 +35,14 @@ class HeldOut:
     passed_through: NDArray[np.bool_]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CardCorrections:
-    """Corrections (0 if a range is passed through) and variances from the predictions of a model, each (n,)."""
+def correct_with_card(
+    dataset: Dataset, card: ModelCard, predicted_m: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+    """Apply the limits, the OOD score and the variances of a card to predictions, shape (n,).
 
-    correction_m: NDArray[np.float32]
-    variance_m2: NDArray[np.float32]
-    passed_through: NDArray[np.bool_]
-
-
-def correct_with_card(dataset: Dataset, card: ModelCard, predicted_m: NDArray[np.float32]) -> CardCorrections:
-    """Apply the limits, the OOD score and the variances of a card to predictions, shape (n,)."""
+    Returns:
+        Corrections (0 if a range is passed through), m; variances, m^2; and which ranges are passed through; each (n,).
+    """
     rule = CorrectionRule(card)
     levels = dataset.rx_power_dbm, dataset.first_path_power_dbm
     with np.errstate(over="ignore", invalid="ignore"):
@@ -53,9 +50,7 @@ def correct_with_card(dataset: Dataset, card: ModelCard, predicted_m: NDArray[np
         accepted = np.array(rule.accepts(predicted_m, score))
         correction, variance = rule.apply(predicted_m, score)
     uncorrected = np.float32(card.variance_uncorrected_m2)
-    return CardCorrections(
-        np.where(accepted, correction, 0.0), np.where(accepted, variance, uncorrected), ~accepted
-    )
+    return np.where(accepted, correction, 0.0), np.where(accepted, variance, uncorrected), ~accepted
 
 
 def evaluate_zero_shot(dataset: Dataset, bundle: Bundle) -> HeldOut:
@@ -72,8 +67,8 @@ def evaluate_zero_shot(dataset: Dataset, bundle: Bundle) -> HeldOut:
     if bundle.card.early_path:
         network_m = dataset.with_early_paths(network_m).astype(np.float32)
     predicted = (linear_bias + network_m).astype(np.float32)
-    corrections = correct_with_card(dataset, bundle.card, predicted)
-    residual = dataset.error_m - corrections.correction_m
+    correction_m, variance_m2, is_passed_through = correct_with_card(dataset, bundle.card, predicted)
+    residual = dataset.error_m - correction_m
 
     _, configuration_index = np.unique(dataset.configurations, return_inverse=True)
     count = np.bincount(configuration_index)
@@ -86,4 +81,4 @@ def evaluate_zero_shot(dataset: Dataset, bundle: Bundle) -> HeldOut:
     residuals = residual, residual - los_offset, residual - offset_of_others[configuration_index]
     errors = dict(zip(NAMES, residuals, strict=True))
     sigmas95 = np.full(len(dataset), bundle.card.interval95_sigmas)
-    return HeldOut(errors, corrections.variance_m2, sigmas95, corrections.passed_through)
+    return HeldOut(errors, variance_m2, sigmas95, is_passed_through)

@@ -77,13 +77,8 @@ def ood_bands_of(dataset: Dataset, known_offset_m: float | None = None) -> OodBa
     scaling = dataset.preprocessing.scaling
     with_levels = scaling is Scaling.PREAMBLE
     unknown = np.full(len(dataset), np.nan, np.float32)
-    features = ood_features(
-        dataset.inputs,
-        scaling,
-        dataset.range_m.astype(np.float32),
-        dataset.rx_power_dbm if with_levels else unknown,
-        dataset.first_path_power_dbm if with_levels else unknown,
-    )
+    levels = (dataset.rx_power_dbm, dataset.first_path_power_dbm) if with_levels else (unknown, unknown)
+    features = ood_features(dataset.inputs, scaling, dataset.range_m.astype(np.float32), *levels)
     values = np.column_stack(features)
     if with_levels and not np.isfinite(values).all(axis=1).any():
         return None

@@ -68,10 +68,8 @@ def quantise_network(
     integers, biases = {}, {}
     limits = np.iinfo(np.int32)
     for name, weight in weights.weight.items():
-        # The first axis of the weights is the outputs; the head has one.
-        unit = (
-            weight_scale[name] if name == HEAD else weight_scale[name].reshape(-1, *[1] * (weight.ndim - 1))
-        )
+        # The first axis of the weights is the outputs; the head has one scale.
+        unit = weight_scale[name].reshape(-1, *[1] * (weight.ndim - 1))
         rounded = np.clip(np.rint(weight / unit), -WEIGHT_LIMIT, WEIGHT_LIMIT)
         integers[name] = rounded.astype(np.int8)
         bias = np.rint(weights.bias[name].astype(float) / (scale[inputs[name][0]] * weight_scale[name]))
