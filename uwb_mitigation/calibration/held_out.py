@@ -69,14 +69,9 @@ class HeldOut:
     def merged(self, second_part: HeldOut, is_first: NDArray[np.bool_]) -> HeldOut:
         """Return the errors of this and another part of a recording; `is_first` shows which ranges are of this part, bool (r,)."""
         order = np.argsort(np.argsort(~is_first, kind="stable"))
-        residual_m, live_m = (
-            {name: np.append(value, second[name])[order] for name, value in first.items()}
-            for first, second in (
-                (self.residual_m, second_part.residual_m),
-                (self.live_m, second_part.live_m),
-            )
-        )
         block = np.append(self.block, second_part.block)[order]
+        residual_m = {k: np.append(v, second_part.residual_m[k])[order] for k, v in self.residual_m.items()}
+        live_m = {k: np.append(v, second_part.live_m[k])[order] for k, v in self.live_m.items()}
         return HeldOut(block, residual_m, live_m, self.is_separate)
 
     def mae_m(self, name: str) -> float:

@@ -340,8 +340,7 @@ def _suspects(fit: JointFit) -> NDArray[np.intp]:
     observations = fit.observations
     loss = fit.config.model.loss(fit.residual_m / fit.scale_m[observations.noise_group])
     by_anchor = np.bincount(observations.anchor, loss * observations.independent)
-    suspects: NDArray[np.intp] = np.argsort(by_anchor)[::-1]
-    return suspects
+    return np.argsort(by_anchor)[::-1]
 
 
 def _displaced(fit: JointFit, row: int) -> tuple[Anchor, float]:

@@ -383,10 +383,7 @@ class _JointProblem:
 
     def _weight(self, robust: NDArray[np.float64]) -> NDArray[np.float64]:
         observations = self._observations
-        weight: NDArray[np.float64] = (
-            robust * observations.independent / self._scale_m[observations.noise_group] ** 2
-        )
-        return weight
+        return robust * observations.independent / self._scale_m[observations.noise_group] ** 2
 
     def _covariance(
         self, solution: Solution, unit: NDArray[np.float64], weight: NDArray[np.float64]

@@ -107,21 +107,18 @@ def _split_at_stops(ranges: Ranges, rows: NDArray[np.intp]) -> list[tuple[NDArra
     for k in range(bins - 1):
         is_still[k] = _is_stationary(ranges, rows[starts[k] : starts[k + 2]], least=2)
     still = is_still | np.concatenate([[False], is_still[:-1]])
-    edges = np.flatnonzero(np.diff(still)) + 1
-    segments: list[tuple[NDArray[np.intp], bool]] = []
-    moving: list[NDArray[np.intp]] = []
-    for run in np.split(np.arange(bins), edges):
+    is_stop = np.zeros(bins, np.bool_)
+    for run in _runs(still):
         piece = rows[starts[run[0]] : starts[run[-1] + 1]]
-        if still[run[0]] and len(run) * BIN_S >= LEAST_S and _is_stationary(ranges, piece):
-            if moving:
-                segments.append((np.concatenate(moving), False))
-                moving = []
-            segments.append((piece, True))
-        elif len(piece):
-            moving.append(piece)
-    if moving:
-        segments.append((np.concatenate(moving), False))
-    return segments
+        is_long = still[run[0]] and len(run) * BIN_S >= LEAST_S
+        is_stop[run] = is_long and _is_stationary(ranges, piece)
+    pieces = ((rows[starts[run[0]] : starts[run[-1] + 1]], bool(is_stop[run[0]])) for run in _runs(is_stop))
+    return [(piece, is_stationary) for piece, is_stationary in pieces if len(piece)]
+
+
+def _runs(values: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
+    """Return the indices of each run of equal values."""
+    return np.split(np.arange(len(values)), np.flatnonzero(np.diff(values)) + 1)
 
 
 def _is_sparse(ranges: Ranges, rows: NDArray[np.intp]) -> bool:

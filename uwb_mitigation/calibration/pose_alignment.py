@@ -55,27 +55,54 @@ _ITERATIONS, _CONVERGED, _FIXED_SD = 40, 1e-5, 1e-9
 _MODEL = NoiseModel(long=1.5, short=1.5)
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class PoseAlignment:
-    """The result.
+    """The result, or where its fit starts.
 
     Attributes:
         time_offset_s, time_offset_sd_s: added to the stamp of a range to get that of the localisation; sd 0 = given.
         lever_arm_m, lever_arm_sd_m: (T, 3), of each tag's antenna in the robot's frame; sd 0 = given, NaN = not observable,
             so that the start value is kept.
+        is_free_time: whether the time offset is estimated. is_free_arm: bool (T, 3), whether each coordinate is.
         pairs: (tag number, anchor row), and `offset_m`, `offset_sd_m` of each.
+        sd: of time offset, lever arms, offsets and regressors, in this order.
         position: float64 (r, 3), of the antenna at each range; NaN = unknown. distance_m: (r,), to the anchor.
     """
 
     time_offset_s: float
-    time_offset_sd_s: float
     lever_arm_m: NDArray[np.float64]
-    lever_arm_sd_m: NDArray[np.float64]
+    is_free_time: bool
+    is_free_arm: NDArray[np.bool_]
     pairs: tuple[tuple[int, int], ...]
-    offset_m: NDArray[np.float64]
-    offset_sd_m: NDArray[np.float64]
-    position: NDArray[np.float64]
-    distance_m: NDArray[np.float64]
+    offset_m: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    sd: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    position: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
+    distance_m: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def time_offset_sd_s(self) -> float:
+        """Standard deviation of the time offset."""
+        return float(self.sd[0]) if self.is_free_time else 0.0
+
+    @property
+    def lever_arm_sd_m(self) -> NDArray[np.float64]:
+        """Standard deviations of the lever arms, (T, 3)."""
+        sd_m = self.sd[1 : 1 + self.lever_arm_m.size].reshape(self.lever_arm_m.shape)
+        return np.where(self.is_free_arm, sd_m, np.nan if self.is_free_arm.any() else 0.0)
+
+    @property
+    def offset_sd_m(self) -> NDArray[np.float64]:
+        """Standard deviations of the offsets of the pairs."""
+        return self.sd[1 + self.lever_arm_m.size :][: len(self.pairs)]
+
+    def check_enough(self, count: int) -> None:
+        """Refuse too few ranges with a pose; offsets alone can be estimated from any number, because their priors are known."""
+        least = MIN_RANGES if self.is_free_time or self.is_free_arm.any() else 1
+        if count < least:
+            raise DatasetError(
+                f"{count} ranges lie within the localisation's times",
+                valid=f"{least} or more: do their clocks agree to {MAX_TIME_OFFSET_S:g} s?",
+            )
 
     def as_json(self) -> dict[str, object]:
         """Return values for JSON; null = not observable. Lever arm of the first tag, and of all tags by their ids."""
@@ -117,57 +144,19 @@ def align_poses(
     """
     if (fewest := min(map(len, paths))) < 2:
         raise DatasetError(f"{fewest} poses of the localisation", valid="two or more")
-    problem, pairs = _AlignmentProblem.of_tags(anchors, tags, paths, regressors)
-    given_arms = np.zeros((len(tags), 3)) if lever_arms_m is None else lever_arms_m
-    start = _Alignment(
-        time_offset_s or 0.0, given_arms, time_offset_s is None, np.full(given_arms.shape, estimate_lever_arm)
-    )
-    alignment = problem.fit(start, given_arms)
-    time_offset, lever_arm = alignment.time_offset_s, alignment.lever_arm_m
-    position, rotation = _poses_at(paths, problem.tag, problem.ranges.stamp_ns, time_offset)
-    antenna = position + np.einsum("nij,nj->ni", rotation, lever_arm[problem.tag])
-    distance = np.linalg.norm(antenna - problem.anchor, axis=1)
-    _check_enough(int(np.isfinite(distance).sum()), start.has_unknowns)
-    lever_arm_sd = np.where(alignment.is_free_arm, alignment.lever_arm_sd_m, np.nan)
-    return PoseAlignment(
-        time_offset_s=time_offset,
-        time_offset_sd_s=float(alignment.sd[0]) if start.is_free_time else 0.0,
-        lever_arm_m=lever_arm,
-        lever_arm_sd_m=lever_arm_sd if estimate_lever_arm else np.zeros(given_arms.shape),
-        pairs=pairs,
-        offset_m=alignment.offset_m,
-        offset_sd_m=alignment.sd[1 + given_arms.size :][: len(pairs)],
-        position=antenna,
-        distance_m=distance,
-    )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Alignment:
-    """Unknowns of an alignment, or where its fit starts.
-
-    Attributes:
-        time_offset_s: as in `PoseAlignment`. lever_arm_m: (T, 3).
-        is_free_time: whether the time offset is estimated. is_free_arm: bool (T, 3), whether each coordinate is.
-        offset_m: of the pairs. sd: of time offset, lever arms, offsets and regressors, in this order.
-    """
-
-    time_offset_s: float
-    lever_arm_m: NDArray[np.float64]
-    is_free_time: bool
-    is_free_arm: NDArray[np.bool_]
-    offset_m: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
-    sd: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
-
-    @property
-    def has_unknowns(self) -> bool:
-        """Whether more than offsets is estimated."""
-        return self.is_free_time or bool(self.is_free_arm.any())
-
-    @property
-    def lever_arm_sd_m(self) -> NDArray[np.float64]:
-        """Standard deviations of the lever arms, (T, 3)."""
-        return self.sd[1 : 1 + self.lever_arm_m.size].reshape(self.lever_arm_m.shape)
+    arms_m = np.zeros((len(tags), 3)) if lever_arms_m is None else lever_arms_m
+    is_free_arm, ranges = np.full(arms_m.shape, estimate_lever_arm), Ranges.of_tags(tags)
+    tag, anchor = np.repeat(np.arange(len(tags)), list(map(len, tags))), anchors.position[ranges.anchor]
+    columns, pair = np.unique(np.stack([tag, ranges.anchor]), axis=1, return_inverse=True)
+    pairs, smoothed = tuple(zip(*columns.tolist(), strict=True)), [path.smoothed() for path in paths]
+    problem = _AlignmentProblem(ranges, tag, pair.reshape(-1), anchor, regressors, smoothed, pairs, arms_m)
+    start = PoseAlignment(time_offset_s or 0.0, arms_m, time_offset_s is None, is_free_arm, pairs)
+    alignment = problem.fit(start)
+    position, rotation = _poses_at(paths, tag, ranges.stamp_ns, alignment.time_offset_s)
+    antenna = position + np.einsum("nij,nj->ni", rotation, alignment.lever_arm_m[tag])
+    distance = np.linalg.norm(antenna - anchor, axis=1)
+    start.check_enough(int(np.isfinite(distance).sum()))
+    return replace(alignment, position=antenna, distance_m=distance)
 
 
 def _poses_at(
@@ -181,19 +170,9 @@ def _poses_at(
     return position, rotation
 
 
-def _check_enough(count: int, alignment_unknown: bool) -> None:
-    """Offsets alone can be estimated from any number of ranges, because their priors are known."""
-    least = MIN_RANGES if alignment_unknown else 1
-    if count < least:
-        raise DatasetError(
-            f"{count} ranges lie within the localisation's times",
-            valid=f"{least} or more: do their clocks agree to {MAX_TIME_OFFSET_S:g} s?",
-        )
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _AlignmentProblem:
-    """n ranges of tags (n,) and pairs (n,) to anchors at (n, 3), and the paths of the T tags. Lever arms are (T, 3)."""
+    """n ranges of tags (n,) and pairs (n,) to anchors at (n, 3), and of the T tags paths and given lever arms (T, 3)."""
 
     ranges: Ranges
     tag: NDArray[np.intp]
@@ -201,19 +180,8 @@ class _AlignmentProblem:
     anchor: NDArray[np.float64]
     regressors: Regressors
     paths: Sequence[PosePath]
-    num_pairs: int
-
-    @classmethod
-    def of_tags(
-        cls, anchors: AnchorMap, tags: Sequence[Ranges], paths: Sequence[PosePath], regressors: Regressors
-    ) -> tuple[_AlignmentProblem, tuple[tuple[int, int], ...]]:
-        """Return the problem of all ranges, and its pairs."""
-        ranges = Ranges.of_tags(tags)
-        tag = np.repeat(np.arange(len(tags)), list(map(len, tags)))
-        pairs, pair = np.unique(np.stack([tag, ranges.anchor]), axis=1, return_inverse=True)
-        position, smoothed = anchors.position[ranges.anchor], [path.smoothed() for path in paths]
-        problem = cls(ranges, tag, pair.reshape(-1), position, regressors, smoothed, pairs.shape[1])
-        return problem, tuple((int(number), int(row)) for number, row in pairs.T)
+    pairs: tuple[tuple[int, int], ...]
+    given_arms: NDArray[np.float64]
 
     def take(self, index: NDArray[np.intp]) -> _AlignmentProblem:
         columns = {name: getattr(self, name)[index] for name in ("tag", "pair", "anchor")}
@@ -221,7 +189,7 @@ class _AlignmentProblem:
             self, ranges=self.ranges.take(index), regressors=self.regressors.select_rows(index), **columns
         )
 
-    def fit(self, start: _Alignment, given_arms: NDArray[np.float64]) -> _Alignment:
+    def fit(self, start: PoseAlignment) -> PoseAlignment:
         """Search the time offset if it is unknown, and fit; coordinates of the arms that are not observable are as given.
 
         Raises:
@@ -232,8 +200,8 @@ class _AlignmentProblem:
             chosen = np.random.default_rng(1).choice(len(self.ranges), MAX_RANGES, replace=False)
             problem = self.take(np.sort(chosen))
         if start.is_free_time:
-            start = replace(start, time_offset_s=problem.likely_time_offset(given_arms))
-        alignment = problem.solve(start, given_arms)
+            start = replace(start, time_offset_s=problem.likely_time_offset())
+        alignment = problem.solve(start)
         if not estimates_arm:
             return alignment
         is_observable = alignment.lever_arm_sd_m < SEPARATED_M
@@ -246,11 +214,11 @@ class _AlignmentProblem:
         if is_observable.all():
             return alignment
         # A level drive does not observe the height of the arm: it would trade off against the offsets.
-        arms = np.where(is_observable, alignment.lever_arm_m, given_arms)
-        return problem.solve(replace(alignment, lever_arm_m=arms, is_free_arm=is_observable), given_arms)
+        arms = np.where(is_observable, alignment.lever_arm_m, self.given_arms)
+        return problem.solve(replace(alignment, lever_arm_m=arms, is_free_arm=is_observable))
 
-    def likely_time_offset(self, lever: NDArray[np.float64]) -> float:
-        """Return the time offset with which the ranges agree best, for given lever arms.
+    def likely_time_offset(self) -> float:
+        """Return the time offset with which the ranges agree best, for the given lever arms.
 
         Raises:
             DatasetError: too few ranges are within the localisation's times.
@@ -260,7 +228,7 @@ class _AlignmentProblem:
         best = (math.inf, 0.0)
         for time_offsets in (COARSE_OFFSETS_S, FINE_OFFSETS_S):
             for time_offset in (best[1] + time_offsets).tolist():
-                error, _ = subset.errors(time_offset, lever)
+                error, _ = subset.errors(time_offset, self.given_arms)
                 residual = np.abs(error - subset.medians(error)[subset.pair])
                 if np.isfinite(residual).sum() >= MIN_RANGES:
                     best = min(best, (float(np.nanmedian(residual)), time_offset))
@@ -276,7 +244,7 @@ class _AlignmentProblem:
         # Its import takes 0.4 s.
         import pandas as pd
 
-        median = pd.Series(error).groupby(self.pair).median().reindex(range(self.num_pairs))
+        median = pd.Series(error).groupby(self.pair).median().reindex(range(len(self.pairs)))
         return np.asarray(median.fillna(0.0), np.float64)
 
     def errors(
@@ -290,9 +258,9 @@ class _AlignmentProblem:
         error = self.ranges.range_m - self.regressors.rows @ self.regressors.mean - distance
         return error, np.einsum("ni,nij->nj", unit, rotation)
 
-    def solve(self, start: _Alignment, given_arms: NDArray[np.float64]) -> _Alignment:
-        """Fit by Gauss-Newton; `given_arms` (T, 3) is the prior of the lever arms."""
-        fit = _AlignmentFit(self, start, given_arms)
+    def solve(self, start: PoseAlignment) -> PoseAlignment:
+        """Fit by Gauss-Newton; the given lever arms are the prior."""
+        fit = _AlignmentFit(self, start)
         gauss_newton(fit.improve, iterations=_ITERATIONS, converged=_CONVERGED, min_iterations=5)
         return fit.result()
 
@@ -300,11 +268,10 @@ class _AlignmentProblem:
 class _AlignmentFit:
     """The unknowns x of an alignment so far: time offset, lever arms, offsets of the pairs, and regressors."""
 
-    def __init__(
-        self, problem: _AlignmentProblem, start: _Alignment, given_arms: NDArray[np.float64]
-    ) -> None:
-        self._problem, self._start, self._given_arms = problem, start, given_arms
-        size, num_pairs, prior = given_arms.size, problem.num_pairs, problem.regressors
+    def __init__(self, problem: _AlignmentProblem, start: PoseAlignment) -> None:
+        self._problem, self._start, self._given_arms = problem, start, problem.given_arms
+        given_arms, num_pairs, prior = problem.given_arms, len(problem.pairs), problem.regressors
+        size = given_arms.size
         self._arms, self._pairs = slice(1, 1 + size), slice(1 + size, 1 + size + num_pairs)
         time_sd = TIME_OFFSET_SD_S if start.is_free_time else _FIXED_SD
         arm_sd = np.where(start.is_free_arm.reshape(-1), LEVER_SD_M, _FIXED_SD)
@@ -331,7 +298,7 @@ class _AlignmentFit:
         self._x = self._x + step
         return float(np.abs(step).max())
 
-    def result(self) -> _Alignment:
+    def result(self) -> PoseAlignment:
         """Return the unknowns and their standard deviations.
 
         Errors persist for longer than a group, and those of the localisation are in all pairs: the sandwich estimator with the
@@ -375,7 +342,7 @@ class _AlignmentFit:
         rows[:, self._pairs.stop :] = problem.regressors.rows
         residual_m = error_m - x[self._pairs][problem.pair] - problem.regressors.rows @ x[self._pairs.stop :]
         is_used = np.isfinite(residual_m) & np.isfinite(rows).all(axis=1)
-        _check_enough(int(is_used.sum()), self._start.has_unknowns)
+        self._start.check_enough(int(is_used.sum()))
         return rows, residual_m, is_used
 
     def _normal_equations(

@@ -127,8 +127,7 @@ class SiteCalibration:
     @property
     def raw_error_m(self) -> NDArray[np.float64]:
         """The errors of the ranges of `solution.rows` as measured, (n,), m."""
-        error_m: NDArray[np.float64] = self.site.ranges.range_m[self.solution.rows] - self.solution.true_m
-        return error_m
+        return self.site.ranges.range_m[self.solution.rows] - self.solution.true_m
 
     @property
     def held_out_error_m(self) -> NDArray[np.float64]:

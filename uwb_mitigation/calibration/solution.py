@@ -181,8 +181,8 @@ def solve_without_truth(
         DatasetError: the solution is not observable, or an anchor position in the file is wrong.
     """
 
-    def solve(data: SiteData, near_offset_m: float | None) -> _RangesOnly:
-        calibration = self_calibrate(
+    def solve(data: SiteData, near_offset_m: float | None) -> SelfCalibration:
+        return self_calibrate(
             data.anchors,
             data.tags,
             regressors(data, has_truth=False),
@@ -192,108 +192,105 @@ def solve_without_truth(
             height_sd_m=height_sd_m,
             near_offset_m=near_offset_m,
         )
-        return _RangesOnly(data, calibration)
 
     def solve_part(data: SiteData) -> SiteSolution:
-        return solve(data, offset_m).solution(solve_part)
+        return _solution_of(data, solve(data, offset_m), solve_part)
 
     complete = solve(site, None)
-    offset_m = complete.checked_offset_m()
-    return complete.solution(solve_part)
+    offset_m = _checked_offset_m(site, complete)
+    return _solution_of(site, complete, solve_part)
 
 
-class _RangesOnly:
-    """The result of `self_calibrate` as a `SiteSolution`."""
+def _pairs_of(site: SiteData, calibration: SelfCalibration) -> Pairs:
+    return {
+        (calibration.tag_ids[tag], site.anchors.anchors[row].id): calibration.pair(tag, row)
+        for tag, row in calibration.pairs()
+    }
 
-    def __init__(self, site: SiteData, calibration: SelfCalibration) -> None:
-        self._site, self._calibration = site, calibration
-        segments = calibration.segments
-        self._site_rows = site.first_rows[segments.tag] + segments.row
-        self._pairs: Pairs = {
-            (calibration.tag_ids[tag], site.anchors.anchors[row].id): calibration.pair(tag, row)
-            for tag, row in calibration.pairs()
-        }
 
-    def checked_offset_m(self) -> float:
-        """Return the common offset, m, and refuse offsets that the drive does not determine.
+def _checked_offset_m(site: SiteData, calibration: SelfCalibration) -> float:
+    """Return the common offset, m, and refuse offsets that the drive does not determine.
 
-        Raises:
-            DatasetError: states the offset and its standard deviation.
-        """
-        remedy = f"at most {MAX_OFFSET_SD_M:g} m: drive between the anchors, not only past them"
-        common_m, common_sd_m = self._calibration.mean()
-        if common_sd_m > MAX_OFFSET_SD_M:
-            raise DatasetError(
-                f"the common offset is not observable: {common_m:.2f} m with a standard deviation of {common_sd_m:.2f} m",
-                valid=remedy,
-            )
-        for (tag, anchor), (value, sd) in self._pairs.items():
-            # With CIRs, only the common offset is subtracted.
-            if sd > MAX_OFFSET_SD_M and not self._site.has_cirs:
-                raise DatasetError(
-                    f"the offset of tag {format_id(tag)} and anchor {format_id(anchor)} is not observable: {value:.2f} m with a "
-                    f"standard deviation of {sd:.2f} m",
-                    valid=f"{remedy}; or an anchors file without this anchor",
-                )
-        return common_m
-
-    def solution(self, solve_part: Callable[[SiteData], SiteSolution]) -> SiteSolution:
-        """Return true ranges and offsets."""
-        calibration = self._calibration
-        segments, observations = calibration.segments, calibration.fit.observations
-        common_m, _ = calibration.mean()
-        distance_m = calibration.distance_m
-        has_truth = np.isfinite(distance_m) & (calibration.distance_sd_m <= MAX_TRUTH_SD_M)
-        has_truth, outliers = _without_outliers(segments.ranges.range_m - distance_m, has_truth)
-        notes = list(calibration.notes)
-        if num_unknown := int((~has_truth).sum()) - outliers:
-            notes.append(
-                f"{num_unknown} of {len(segments.ranges)} ranges are not used for the fit: the other anchors do not determine "
-                "the tag position"
-            )
-        labelled = np.flatnonzero(has_truth & self._site.table["is_usable"][self._site_rows])
-        return SiteSolution(
-            rows=self._site_rows[labelled],
-            true_m=distance_m[labelled],
-            pairs=self._pairs,
-            common_m=common_m,
-            common_share=SUBTRACTED_SHARE if self._site.has_cirs else 1.0,
-            offsets_refused=self._offsets_refused(has_truth),
-            outliers=outliers,
-            notes=tuple(notes),
-            errors_of=functools.partial(self._errors_of, has_truth),
-            solve_part=solve_part,
-            height=calibration.fit.config.height if self._site.height_m is None else None,
-            antenna_position=np.full((len(self._site.table["is_usable"]), 3), np.nan),
-            track=calibration.fit.position,
-            track_of=observations.knot_segment,
+    Raises:
+        DatasetError: states the offset and its standard deviation.
+    """
+    remedy = f"at most {MAX_OFFSET_SD_M:g} m: drive between the anchors, not only past them"
+    common_m, common_sd_m = calibration.mean()
+    if common_sd_m > MAX_OFFSET_SD_M:
+        raise DatasetError(
+            f"the common offset is not observable: {common_m:.2f} m with a standard deviation of {common_sd_m:.2f} m",
+            valid=remedy,
         )
+    for (tag, anchor), (value, sd) in _pairs_of(site, calibration).items():
+        # With CIRs, only the common offset is subtracted.
+        if sd > MAX_OFFSET_SD_M and not site.has_cirs:
+            raise DatasetError(
+                f"the offset of tag {format_id(tag)} and anchor {format_id(anchor)} is not observable: {value:.2f} m with a "
+                f"standard deviation of {sd:.2f} m",
+                valid=f"{remedy}; or an anchors file without this anchor",
+            )
+    return common_m
 
-    def _offsets_refused(self, has_truth: NDArray[np.bool_]) -> str:
-        """Return why offsets of single anchors are not used, see `SiteSolution`."""
-        if not self._calibration.has_redundant_anchors:
-            return "need more anchors"
-        displacement_m, displacement_sd_m = self._calibration.displacement()
-        if displacement_sd_m > max(MIN_DISPLACEMENT_SD_M, displacement_m):
-            return "look like a displacement of the whole track: drive nearer to each anchor"
-        ranges = self._calibration.segments.ranges
-        anchor, error_m = ranges.anchor[has_truth], (ranges.range_m - self._calibration.distance_m)[has_truth]
-        for row in np.unique(anchor):
-            error_m[anchor == row] -= np.median(error_m[anchor == row])
-        low, high = np.quantile(error_m, (0.05, 0.95)) if len(error_m) else (0.0, math.inf)
-        if high > -MAX_SKEWNESS * low:
-            return "look like those of walls, which make many ranges longer"
-        return ""
 
-    def _errors_of(self, has_truth: NDArray[np.bool_], range_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        fit, segments = self._calibration.fit, self._calibration.segments
-        index, corrected_m = fit.observations.observation_index, range_m[self._site_rows]
+def _solution_of(
+    site: SiteData, calibration: SelfCalibration, solve_part: Callable[[SiteData], SiteSolution]
+) -> SiteSolution:
+    """Return true ranges and offsets; the true ranges are distances from the track of the other anchors."""
+    segments, fit, distance_m = calibration.segments, calibration.fit, calibration.distance_m
+    site_rows = site.first_rows[segments.tag] + segments.row
+    common_m, _ = calibration.mean()
+    has_truth = np.isfinite(distance_m) & (calibration.distance_sd_m <= MAX_TRUTH_SD_M)
+    has_truth, outliers = _without_outliers(segments.ranges.range_m - distance_m, has_truth)
+    notes = list(calibration.notes)
+    if num_unknown := int((~has_truth).sum()) - outliers:
+        notes.append(
+            f"{num_unknown} of {len(segments.ranges)} ranges are not used for the fit: the other anchors do not determine "
+            "the tag position"
+        )
+    labelled = np.flatnonzero(has_truth & site.table["is_usable"][site_rows])
+
+    def errors_of(range_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        index, corrected_m = fit.observations.observation_index, range_m[site_rows]
         antenna, _ = fit.leave_anchors_out(medians(corrected_m, index))
-        anchor = self._site.anchors.position[segments.ranges.anchor]
+        anchor = site.anchors.position[segments.ranges.anchor]
         error_m = corrected_m - np.linalg.norm(antenna[index] - anchor, axis=1)
         errors_m = np.full(len(range_m), np.nan)
-        errors_m[self._site_rows] = np.where(has_truth, error_m, np.nan)
+        errors_m[site_rows] = np.where(has_truth, error_m, np.nan)
         return errors_m
+
+    return SiteSolution(
+        rows=site_rows[labelled],
+        true_m=distance_m[labelled],
+        pairs=_pairs_of(site, calibration),
+        common_m=common_m,
+        common_share=SUBTRACTED_SHARE if site.has_cirs else 1.0,
+        offsets_refused=_offsets_refused(calibration, has_truth),
+        outliers=outliers,
+        notes=tuple(notes),
+        errors_of=errors_of,
+        solve_part=solve_part,
+        height=fit.config.height if site.height_m is None else None,
+        antenna_position=np.full((len(site.table), 3), np.nan),
+        track=fit.position,
+        track_of=fit.observations.knot_segment,
+    )
+
+
+def _offsets_refused(calibration: SelfCalibration, has_truth: NDArray[np.bool_]) -> str:
+    """Return why offsets of single anchors are not used, see `SiteSolution`."""
+    if not calibration.has_redundant_anchors:
+        return "need more anchors"
+    displacement_m, displacement_sd_m = calibration.displacement()
+    if displacement_sd_m > max(MIN_DISPLACEMENT_SD_M, displacement_m):
+        return "look like a displacement of the whole track: drive nearer to each anchor"
+    ranges = calibration.segments.ranges
+    anchor, error_m = ranges.anchor[has_truth], (ranges.range_m - calibration.distance_m)[has_truth]
+    for row in np.unique(anchor):
+        error_m[anchor == row] -= np.median(error_m[anchor == row])
+    low, high = np.quantile(error_m, (0.05, 0.95)) if len(error_m) else (0.0, math.inf)
+    if high > -MAX_SKEWNESS * low:
+        return "look like those of walls, which make many ranges longer"
+    return ""
 
 
 def solve_with_truth(

@@ -245,5 +245,4 @@ def _relative_sd(position: NDArray[np.float64], covariance: NDArray[np.float64])
     basis, _ = np.linalg.qr(rigid.reshape(3 * m, 4))
     projection = np.eye(3 * m) - basis @ basis.T
     spread = np.diag(projection @ covariance.reshape(3 * m, 3 * m) @ projection).reshape(m, 3)
-    sd: NDArray[np.float64] = np.sqrt(spread)
-    return sd
+    return np.sqrt(spread)

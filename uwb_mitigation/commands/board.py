@@ -9,8 +9,8 @@ from typing import Annotated
 import typer
 
 from uwb_mitigation.commands.support import console
-from uwb_mitigation.commands.support.checks import check_output, output_option
 from uwb_mitigation.commands.support.console import JsonOption, print_line
+from uwb_mitigation.commands.support.options import check_output, output_option
 from uwb_mitigation.errors import ModelError
 
 ModelOption = Annotated[

@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from uwb_mitigation.commands.support import console
-from uwb_mitigation.commands.support import position_options as options
-from uwb_mitigation.commands.support.checks import check_output, check_replaceable, output_option
+from uwb_mitigation.commands.support import console, options
 from uwb_mitigation.commands.support.console import JsonOption, print_line, show_table, warn
+from uwb_mitigation.commands.support.options import check_output, check_replaceable, output_option
 from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError, format_id
 
 if TYPE_CHECKING:

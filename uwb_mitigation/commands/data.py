@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from uwb_mitigation.commands.support import console
-from uwb_mitigation.commands.support.checks import output_option
 from uwb_mitigation.commands.support.console import JsonOption, print_line, show_table
+from uwb_mitigation.commands.support.options import output_option
 from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError, check_name
 from uwb_mitigation.types.stamps import NS_PER_S
 

@@ -25,8 +25,8 @@ import typer
 
 import uwb_mitigation
 from uwb_mitigation.commands.support import console
-from uwb_mitigation.commands.support.checks import check_output, output_option
 from uwb_mitigation.commands.support.console import JsonOption, print_line
+from uwb_mitigation.commands.support.options import check_output, output_option
 from uwb_mitigation.errors import LinkError, ParameterError
 from uwb_mitigation.files import write_atomically
 

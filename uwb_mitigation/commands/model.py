@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from uwb_mitigation.commands.support import console, model_tables
-from uwb_mitigation.commands.support.bundles import ModelOption, show_models
-from uwb_mitigation.commands.support.checks import OffsetsOption, ScalingName, check_output, output_option
+from uwb_mitigation.commands.support import console, model_tables, options
+from uwb_mitigation.commands.support.bundles import show_models
 from uwb_mitigation.commands.support.console import JsonOption
 from uwb_mitigation.errors import ParameterError
 
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
     from uwb_mitigation.training.data.dataset import Dataset
 
 _DATA_HELP = "Recording with true ranges: a bag, or a folder of DecaRanging logs."
-OutputOption = Annotated[Path, output_option("FILE", "Bundle to write.")]
+OutputOption = Annotated[Path, options.output_option("FILE", "Bundle to write.")]
 
 
 def train(
@@ -41,7 +40,7 @@ def train(
     ] = "auto",
     samples: Annotated[int, typer.Option(help="Window length K.")] = 157,
     scaling: Annotated[
-        ScalingName, typer.Option(help="Scaling of the CIR by its preamble count, or by its maximum.")
+        options.ScalingName, typer.Option(help="Scaling of the CIR by its preamble count, or by its maximum.")
     ] = "preamble",
     epochs: Annotated[int | None, typer.Option(help="Passes over the data.")] = None,
     learning_rate: Annotated[float | None, typer.Option(help="Learning rate of Adam.")] = None,
@@ -67,13 +66,13 @@ def train(
 
     set_options: dict[str, Any] = {"epochs": epochs, "learning_rate": learning_rate, "seed": seed}
     set_options = {key: value for key, value in set_options.items() if value is not None}
-    architecture, options = Remnet(samples), FitOptions(**set_options)
-    check_output(output, force)
+    architecture, fit_options = Remnet(samples), FitOptions(**set_options)
+    options.check_output(output, force)
     from uwb_mitigation.training import train as training
     from uwb_mitigation.training.fit import candidates, fitting  # noqa: F401  (imports torch)
 
     name, dataset = _dataset(data, Preprocessing(samples, Scaling(scaling)), truth or ())
-    recipe = candidates.Recipe(architecture, options, replace(candidates.NETWORK_ONLY, **set_options))
+    recipe = candidates.Recipe(architecture, fit_options, replace(candidates.NETWORK_ONLY, **set_options))
     with console.stage_bars() as on_progress:
         job = training.TrainingJob(dataset, name, output, folds, on_progress)
         trained = training.train_new_model(job, recipe, recipe_name)
@@ -82,13 +81,13 @@ def train(
 
 
 def train_universal(
-    output: Annotated[Path, output_option("FILE", "int8 bundle to write.")],
+    output: Annotated[Path, options.output_option("FILE", "int8 bundle to write.")],
     seed: Annotated[
         int, typer.Option(min=0, max=2**31, help="Seed of the simulated buildings and of the network.")
     ] = 0,
     samples: Annotated[int, typer.Option(help="Window length K.")] = 157,
     scaling: Annotated[
-        ScalingName, typer.Option(help="max: for windows without preamble counts.")
+        options.ScalingName, typer.Option(help="max: for windows without preamble counts.")
     ] = "preamble",
     radio: Annotated[
         Literal["dw1000", "dw3000"], typer.Option(help="dw3000: for windows of an STS.")
@@ -125,7 +124,7 @@ def train_universal(
     preprocessing = Preprocessing(samples, Scaling(scaling))
     radios = {"dw1000": RADIO, "dw3000": DW3000_STS}
     for path in (output, *([float_output] if float_output else [])):
-        check_output(path, force)
+        options.check_output(path, force)
     from uwb_mitigation.training import universal
 
     plan = universal.TrainingPlan(
@@ -170,7 +169,7 @@ def quantise(
 
     source = load_bundle(model)
     quantisation.check(source)
-    check_output(output, force)
+    options.check_output(output, force)
     with console.reading() as on_record:
         dataset = recordings.load_inputs(data, source.card.preprocessing, on_record)
     console.show_skipped(dataset.skipped)
@@ -200,8 +199,8 @@ def _cross_validation(description: str, default: str, **limits: Any) -> Any:
 
 def evaluate(
     data: Annotated[Path, typer.Option(help=_DATA_HELP)],
-    model: ModelOption = None,
-    offsets: OffsetsOption = None,
+    model: options.ModelOption = None,
+    offsets: options.OffsetsOption = None,
     cross_validate: Annotated[
         Literal["configuration"] | None,
         typer.Option(
@@ -215,7 +214,7 @@ def evaluate(
     ] = None,
     folds: Annotated[int | None, _cross_validation("number of folds.", "6")] = None,
     scaling: Annotated[
-        ScalingName | None, _cross_validation("max for data without preamble counts.", "preamble")
+        options.ScalingName | None, _cross_validation("max for data without preamble counts.", "preamble")
     ] = None,
     json: JsonOption = None,
 ) -> None:

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from uwb_mitigation.commands.support import console
-from uwb_mitigation.commands.support.bundles import ModelOption, bundle_for
-from uwb_mitigation.commands.support.checks import check_output, output_option
+from uwb_mitigation.commands.support.bundles import bundle_for
 from uwb_mitigation.commands.support.console import JsonOption, print_line, show_table, warn
+from uwb_mitigation.commands.support.options import ModelOption, check_output, output_option
 from uwb_mitigation.errors import ParameterError, parse_id
 
 if TYPE_CHECKING:

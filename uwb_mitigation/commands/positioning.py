@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from uwb_mitigation.commands.support import console
-from uwb_mitigation.commands.support import position_options as options
+from uwb_mitigation.commands.support import console, options
 from uwb_mitigation.commands.support.bundles import show_models
-from uwb_mitigation.commands.support.checks import check_replaceable, output_option
 from uwb_mitigation.commands.support.console import JsonOption, print_line, show_table, warn
+from uwb_mitigation.commands.support.options import check_replaceable, output_option
 from uwb_mitigation.errors import ParameterError, check_name, format_id
 
 if TYPE_CHECKING:
@@ -94,11 +93,10 @@ def track(
     from uwb_mitigation.positioning.recorded_tracks import track_tags
     from uwb_mitigation.recordings.bag.writer import BagWriter
     from uwb_mitigation.types.anchors import anchors_path, save_anchors
-    from uwb_mitigation.types.offsets import NO_OFFSETS
 
     corrector = mitigation(settings)
     config, recorded = _read(bag, anchors, settings, corrector)
-    if not corrector.used and (settings.model or settings.offsets is not NO_OFFSETS):
+    if not corrector.used and (settings.model or settings.offsets):
         raise ParameterError("--model or --offsets", where=str(bag), valid="a bag without corrected ranges")
     show_models(corrector.used)
     several = len(recorded.tags) > 1

@@ -12,9 +12,9 @@ import typer
 from rich.markup import escape
 
 from uwb_mitigation.commands.support import console
-from uwb_mitigation.commands.support.bundles import ModelOption, show_models
-from uwb_mitigation.commands.support.checks import OffsetsOption, output_option
+from uwb_mitigation.commands.support.bundles import show_models
 from uwb_mitigation.commands.support.console import JsonOption, show_table
+from uwb_mitigation.commands.support.options import ModelOption, OffsetsOption, output_option
 from uwb_mitigation.errors import ParameterError, RecordingError, UwbMitigationError
 from uwb_mitigation.files import os_errors
 

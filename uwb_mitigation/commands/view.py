@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from uwb_mitigation.commands.support import console
-from uwb_mitigation.commands.support import position_options as options
+from uwb_mitigation.commands.support import console, options
 from uwb_mitigation.commands.support.bundles import show_models
 
 if TYPE_CHECKING:

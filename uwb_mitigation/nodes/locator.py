@@ -7,6 +7,7 @@ import hashlib
 import importlib
 import math
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -97,9 +98,6 @@ class _Outputs:
         self.monitor = PositionMonitor(tag)
         self.published_ns = self.smoothed_ns = -(1 << 62)
 
-    def all(self) -> tuple[Publisher, ...]:
-        return self.pose, self.odometry, self.smoothed
-
 
 class Locator(ManagedNode):
     """Lifecycle: configure reads the anchors and creates the topics, activate starts tracking tags.
@@ -124,7 +122,7 @@ class Locator(ManagedNode):
         self._ranges_topic, self._good_s, self._has_warned = "", math.inf, False
         self._malformed = self._lost = 0
         self._unknown_anchors: set[int] = set()
-        self._processing_ns: list[int] = []
+        self._processing_ns: deque[int] = deque(maxlen=diagnostics.MAX_LATENCIES)
         self._meter = diagnostics.RateMonitor(self.now_ns)
         self._state_file = StateFile(self.respawn_file("state"), self.get_logger())
         # Without anchors it keeps running, so that the diagnostics name the reason.
@@ -235,8 +233,7 @@ class Locator(ManagedNode):
             if outputs.monitor.age_s <= STALE_S:
                 values[f"{outputs.monitor.name} mean residuals m"] = outputs.monitor.residuals()
         values |= self._meter.entries()
-        durations_ns, self._processing_ns = self._processing_ns, []
-        values |= diagnostics.percentiles("processing", durations_ns)
+        values |= diagnostics.percentiles("processing", diagnostics.drain(self._processing_ns))
         return "host", level, text, values
 
     def _log(self, warnings: list[str], good: str) -> None:
@@ -348,9 +345,7 @@ class Locator(ManagedNode):
                 self._publish_estimate(outputs, base)
             else:
                 self._publish_base(outputs, held_estimate)
-        now_ns = time.perf_counter_ns()
-        if len(self._processing_ns) < 20_000:
-            self._processing_ns.append(now_ns - began_ns)
+        self._processing_ns.append(time.perf_counter_ns() - began_ns)
         self._meter.add(self.now_ns() - key.stamp_ns)
 
     def _outputs_of(self, tag: TagState) -> _Outputs:
@@ -362,8 +357,6 @@ class Locator(ManagedNode):
             # Tags of several robots share the map, so the namespace keeps their frames apart.
             frame = f"{self.get_namespace()}/{name}".lstrip("/")
             outputs = _Outputs(self, tag, None if plain else tag.tag_id, frame)
-            for publisher in outputs.all():
-                publisher.on_activate(None)
             self._outputs[tag.tag_id] = outputs
             self.get_logger().info(f"tag {format_id(tag.tag_id)} on {outputs.pose.topic_name}")
         return outputs

@@ -81,8 +81,7 @@ class Area:
 
     def clip(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the nearest point of the box to each position float64 (..., 3)."""
-        nearest: NDArray[np.float64] = np.clip(position, self.low, self.high)
-        return nearest
+        return np.clip(position, self.low, self.high)
 
 
 def parse_lever_arm(text: str | None) -> tuple[float, float, float] | None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Annotated, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ STUDENT_DOF = 4.0
 
 @dataclass(frozen=True, slots=True)
 class NoiseModel:
-    """Motion and range error model.
+    """Motion and range error model; the annotations contain the limits.
 
     Attributes:
         acceleration: root of the spectral density of white acceleration, m/s^1.5: 1 for robots, people and
@@ -39,32 +40,20 @@ class NoiseModel:
             decreases. Obstacles lengthen ranges only, so `long` is the smaller one.
     """
 
-    acceleration: float = 0.8
-    speed: float = 1.0
-    range_sd: float = 0.10
-    white: float = 0.4
-    persistence_s: float = 1.0
-    offset_sd: float = 0.15
-    pair_sd: float = 0.10
-    smoother_white: float = 0.8
-    long: float = 0.8
-    short: float = 1.5
+    acceleration: Annotated[float, (1e-3, 1e3)] = 0.8
+    speed: Annotated[float, (1e-3, 1e3)] = 1.0
+    range_sd: Annotated[float, (1e-3, 1e2)] = 0.10
+    white: Annotated[float, (1e-3, 1.0)] = 0.4
+    persistence_s: Annotated[float, (1e-3, 1e6)] = 1.0
+    offset_sd: Annotated[float, (0.0, 1e2)] = 0.15
+    pair_sd: Annotated[float, (0.0, 1e2)] = 0.10
+    smoother_white: Annotated[float, (1e-3, 1.0)] = 0.8
+    long: Annotated[float, (0.1, 100.0)] = 0.8
+    short: Annotated[float, (0.1, 100.0)] = 1.5
 
     def __post_init__(self) -> None:
-        limits = {
-            "acceleration": (1e-3, 1e3),
-            "speed": (1e-3, 1e3),
-            "range_sd": (1e-3, 1e2),
-            "white": (1e-3, 1.0),
-            "persistence_s": (1e-3, 1e6),
-            "offset_sd": (0.0, 1e2),
-            "pair_sd": (0.0, 1e2),
-            "smoother_white": (1e-3, 1.0),
-            "long": (0.1, 100.0),
-            "short": (0.1, 100.0),
-        }
-        for name, (low, high) in limits.items():
-            check_range("motion and range model", name, getattr(self, name), low, high)
+        for name, hint in _HINTS.items():
+            check_range("motion and range model", name, getattr(self, name), *hint.__metadata__[0])
 
     def inflation(self, z: float) -> float:
         """Return the factor of the variance of a range with the normalised residual `z` (measured - expected)."""
@@ -74,8 +63,7 @@ class NoiseModel:
     def weight(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the factor of the weights of ranges with normalised residuals `z`: the inverse of `inflation`."""
         ratio = np.where(z > 0.0, self.long, self.short) / np.maximum(np.abs(z), 1e-12)
-        weight: NDArray[np.float64] = np.minimum(1.0, ratio) ** 2
-        return weight
+        return np.minimum(1.0, ratio) ** 2
 
     def loss(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return minus the log likelihood of normalised residuals; its derivative is z * weight(z).
@@ -85,10 +73,7 @@ class NoiseModel:
         """
         limit = np.where(z > 0.0, self.long, self.short)
         ratio = np.maximum(np.abs(z) / limit, 1e-12)
-        loss: NDArray[np.float64] = np.where(
-            ratio <= 1.0, 0.5 * z * z, limit**2 * (0.5 + np.log(np.maximum(ratio, 1.0)))
-        )
-        return loss
+        return np.where(ratio <= 1.0, 0.5 * z * z, limit**2 * (0.5 + np.log(np.maximum(ratio, 1.0))))
 
     def student_loss(self, z: float) -> float:
         """Return minus the log likelihood of a normalised innovation for Student's t-distribution, without its constant.
@@ -108,6 +93,9 @@ class NoiseModel:
         is_known = np.isfinite(published_m2) & (published_m2 > 0.0)
         return np.where(is_known, published_m2, self.range_sd**2)
 
+
+# Once: this takes as long as 20 checks.
+_HINTS = get_type_hints(NoiseModel, include_extras=True)
 
 MAD_TO_SD = 1.4826
 MIN_ALIKE = 20
@@ -178,8 +166,7 @@ class Regressors:
     @property
     def information(self) -> NDArray[np.float64]:
         """Inverse variances of the priors, float64 (q,)."""
-        inverse: NDArray[np.float64] = 1.0 / np.maximum(self.sd, 1e-6) ** 2
-        return inverse
+        return 1.0 / np.maximum(self.sd, 1e-6) ** 2
 
     def select_rows(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Regressors:
         """Return the parameters for the ranges at `index`."""

@@ -35,13 +35,13 @@ class TrackErrors:
     """
 
     epochs: int
-    rmse: float
-    median: float
-    p95: float
-    coverage95: float
-    nees_per_dof: float
-    exceeded: float
-    height_rmse: float
+    rmse: float = math.nan
+    median: float = math.nan
+    p95: float = math.nan
+    coverage95: float = math.nan
+    nees_per_dof: float = math.nan
+    exceeded: float = math.nan
+    height_rmse: float = math.nan
     heading_rmse_deg: float = math.nan
     heading_found_after_s: float = math.nan
     heading_exceeded: float = math.nan
@@ -63,7 +63,7 @@ _JSON_KEYS = {
 }
 
 
-NO_ERRORS = TrackErrors(0, *(math.nan,) * 7)
+NO_ERRORS = TrackErrors(0)
 
 
 def track_errors(track: Track, truth: TruePath, offset_ns: int = 0) -> TrackErrors:
@@ -98,27 +98,24 @@ def errors_of(
 ) -> TrackErrors:
     """Return the errors of n positions (n, 3) with covariances (n, d, d) from true positions (n, 3)."""
     error = position[:, :2] - true[:, :2]
-    distance = np.hypot(*error.T)
-    plane = covariance[:, :2, :2]
-    coverage = nees = exceeded = height_coverage = height_exceeded = math.nan
-    height_error = np.abs(position[:, 2] - true[:, 2])
-    if len(error) and np.isfinite(plane).all():
-        squared = np.einsum("ni,ni->n", error, np.linalg.solve(plane, error[..., None])[..., 0])
-        coverage = float((squared <= CHI2_95).mean())
-        nees = float(squared.mean() / 2.0)
-        exceeded = float((np.abs(error) > protection_levels(plane)).any(axis=1).mean())
-        height_sd = np.sqrt(covariance[:, 2, 2])
-        height_coverage = float((height_error <= NORMAL95 * height_sd).mean())
-        height_exceeded = float((height_error > PROTECTION * height_sd).mean())
-    return TrackErrors(
+    distance, height_error = np.hypot(*error.T), np.abs(position[:, 2] - true[:, 2])
+    errors = TrackErrors(
         len(error),
-        float(np.sqrt(np.mean(distance**2))),
-        float(np.median(distance)),
-        float(np.percentile(distance, 95)),
-        coverage,
-        nees,
-        exceeded,
-        float(np.sqrt(np.mean(height_error**2))),
-        height_coverage95=height_coverage,
-        height_exceeded=height_exceeded,
+        rmse=float(np.sqrt(np.mean(distance**2))),
+        median=float(np.median(distance)),
+        p95=float(np.percentile(distance, 95)),
+        height_rmse=float(np.sqrt(np.mean(height_error**2))),
+    )
+    plane = covariance[:, :2, :2]
+    if not len(error) or not np.isfinite(plane).all():
+        return errors
+    height_sd = np.sqrt(covariance[:, 2, 2])
+    squared = np.einsum("ni,ni->n", error, np.linalg.solve(plane, error[..., None])[..., 0])
+    return replace(
+        errors,
+        coverage95=float((squared <= CHI2_95).mean()),
+        nees_per_dof=float(squared.mean() / 2.0),
+        exceeded=float((np.abs(error) > protection_levels(plane)).any(axis=1).mean()),
+        height_coverage95=float((height_error <= NORMAL95 * height_sd).mean()),
+        height_exceeded=float((height_error > PROTECTION * height_sd).mean()),
     )

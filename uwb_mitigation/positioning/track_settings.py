@@ -10,7 +10,7 @@ from uwb_mitigation.positioning.config import EstimatorConfig, RobotData
 from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.types.anchors import AnchorMap
-from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets
+from uwb_mitigation.types.offsets import Offsets
 from uwb_mitigation.types.tracks import Heights
 
 MAX_STAMP_OFFSET_S = 3600.0
@@ -29,7 +29,7 @@ class TrackSettings:
         lever_arm_m: antenna in the frame of the robot, m; None: from the transforms of the recording.
         stamp_offset_s: added to the stamps of the ranges.
         acceleration: of the motion model, see `NoiseModel`.
-        model, offsets: correct raw ranges: file or name of a model (None: the shipped ones), and offsets of the radios.
+        model, offsets: correct raw ranges: file or name of a model (None: the shipped ones), and offsets of the radios (None: 0).
 
     Raises:
         ParameterError: a value is out of its range, or two options exclude each other.
@@ -45,7 +45,7 @@ class TrackSettings:
     stamp_offset_s: float = 0.0
     acceleration: float = NoiseModel().acceleration
     model: Path | None = None
-    offsets: Offsets | float | str | Path = NO_OFFSETS
+    offsets: Offsets | float | str | Path | None = None
 
     def __post_init__(self) -> None:
         if not abs(self.stamp_offset_s) <= MAX_STAMP_OFFSET_S:

@@ -22,6 +22,7 @@ from uwb_mitigation.recordings.bag.odometry import BASE_LINK, read_imu, read_odo
 from uwb_mitigation.recordings.bag.pose_paths import read_heights, read_lever_arm, read_range_frame
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.types.anchors import Anchor, AnchorMap
+from uwb_mitigation.types.offsets import NO_OFFSETS
 from uwb_mitigation.types.ros.poses import (
     BodyTwist,
     encode_odometry,
@@ -44,7 +45,7 @@ def mitigation(settings: TrackSettings) -> Mitigation:
     Raises:
         ModelError: the model cannot be loaded.
     """
-    return Mitigation(load_model(settings.model), settings.offsets, median_at_rest=True)
+    return Mitigation(load_model(settings.model), settings.offsets or NO_OFFSETS, median_at_rest=True)
 
 
 def read_config(

@@ -1,4 +1,4 @@
-"""The option `--model`, and the model of a command that uses only one."""
+"""The models that a command has used, and the model of a command that uses only one."""
 
 from __future__ import annotations
 
@@ -6,9 +6,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from uwb_mitigation.commands.support import console
 from uwb_mitigation.errors import UwbMitigationError
@@ -18,15 +16,6 @@ if TYPE_CHECKING:
     from uwb_mitigation.mitigation.model.choice import Choice
 
 MAX_RECORDS_READ = 1000
-
-ModelOption = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="FILE|NAME",
-        help="Bundle, or the name of a shipped one. Default: `auto`, the shipped model that fits the radio and the CIR.",
-        show_default=False,
-    ),
-]
 
 
 def show_models(models: Mapping[Choice, int]) -> None:

@@ -61,8 +61,7 @@ class RadioSource(Protocol):
 def radio_source(name: str) -> RadioSource:
     """Return the module of a source; it is imported here, because each needs other dependencies."""
     module = "lines" if name == "pans" else name
-    source: RadioSource = importlib.import_module(f"uwb_mitigation.radios.{module}")
-    return source
+    return importlib.import_module(f"uwb_mitigation.radios.{module}")
 
 
 class RadioFeed:

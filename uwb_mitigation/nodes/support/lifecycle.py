@@ -111,6 +111,9 @@ class ManagedNode(LifecycleNode):
             resource = endpoints.create_publisher(self, kind, relative(topic))
         else:
             resource = self.create_lifecycle_publisher(kind, relative(topic), qos)
+        if self.is_active:
+            # `on_activate` activates the others.
+            resource.on_activate(None)
         return self.destroy_at_close(resource, self.destroy_lifecycle_publisher)
 
     def subscription(

@@ -48,7 +48,6 @@ class SensorRanges:
                 return
             topic = f"{RANGE_CORRECTED}/anchor_{format_id(anchor_id)}"
             publisher = self._publishers[anchor_id] = self._node.publisher(self._kind, topic)
-            publisher.on_activate(None)
         valid = math.isfinite(corrected.range_m) and math.isfinite(corrected.variance_m2)
         publisher.publish(
             self._kind(

@@ -86,8 +86,7 @@ class LeastSquares:
         self, knot: NDArray[np.intp] | int, unknown: NDArray[np.intp] | int | range
     ) -> NDArray[np.intp]:
         """Columns of unknowns of knots; the arguments are broadcast."""
-        columns: NDArray[np.intp] = np.asarray(knot) * self.unknowns + np.asarray(unknown, np.intp)
-        return columns
+        return np.asarray(knot) * self.unknowns + np.asarray(unknown, np.intp)
 
     def of_shared(self, unknown: NDArray[np.intp] | int | range) -> NDArray[np.intp]:
         """Columns of shared unknowns."""

@@ -390,5 +390,4 @@ def _fused(
 
 def _regular(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the covariances without the zero variances of a level tag."""
-    regular: NDArray[np.float64] = covariance + 1e-9 * np.eye(covariance.shape[-1])
-    return regular
+    return covariance + 1e-9 * np.eye(covariance.shape[-1])

@@ -1,20 +1,40 @@
-"""The options of commands that estimate positions, in one place."""
+"""Options that commands share, and checks of files before a command starts its work."""
 
 from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import typer
 
-from uwb_mitigation.commands.support.bundles import ModelOption
-from uwb_mitigation.commands.support.checks import OffsetsOption
+from uwb_mitigation.errors import ParameterError
 
 if TYPE_CHECKING:
     from uwb_mitigation.positioning.track_settings import TrackSettings
+
+ScalingName = Literal["preamble", "max"]
+"""Values of `Scaling`, which takes long to import."""
+
+OffsetsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--offsets",
+        metavar="M|FILE",
+        help="Range offsets of the radios due to antenna delays: metres, or a file written by `uwb-mitigation offset`.",
+    ),
+]
+
+ModelOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE|NAME",
+        help="Bundle, or the name of a shipped one. Default: `auto`, the shipped model that fits the radio and the CIR.",
+        show_default=False,
+    ),
+]
 
 AnchorsOption = Annotated[
     Path | None,
@@ -25,6 +45,30 @@ AnchorsOption = Annotated[
         "BAG X.mcap.",
     ),
 ]
+
+
+def output_option(metavar: str, description: str) -> Any:
+    """Return the option `-o` for what a command writes."""
+    return typer.Option("-o", "--output", metavar=metavar, help=description)
+
+
+def check_replaceable(files: Iterable[Path], force: bool) -> None:
+    """Raise a ParameterError if one of the files exists, unless `force` is set."""
+    for file in files:
+        if file.exists() and not force:
+            raise ParameterError("exists already", where=str(file), valid="--force replaces it")
+
+
+def check_output(output: Path, force: bool = True, suffix: str = ".onnx") -> None:
+    """Check that a file with a suffix can be written to a path, with `force` also over an existing file.
+
+    Raises:
+        ParameterError: it cannot.
+    """
+    if (suffix and output.suffix != suffix) or output.is_dir() or not output.resolve().parent.is_dir():
+        valid = f"a file {suffix} in an existing folder" if suffix else "a file in an existing folder"
+        raise ParameterError("cannot be written", where=str(output), valid=valid)
+    check_replaceable([output], force)
 
 
 def _option(default: Any, kind: Any, metavar: str | None, text: str) -> tuple[Any, Any]:
@@ -61,13 +105,8 @@ def track_settings(**values: Any) -> TrackSettings:
     """
     from uwb_mitigation.positioning.geometry import Area, parse_lever_arm
     from uwb_mitigation.positioning.track_settings import TrackSettings
-    from uwb_mitigation.types.offsets import NO_OFFSETS
 
-    parse: dict[str, Callable[[Any], Any]] = {
-        "area": Area.parse,
-        "lever_arm": parse_lever_arm,
-        "offsets": lambda offsets: offsets or NO_OFFSETS,
-    }
+    parse: dict[str, Callable[[Any], Any]] = {"area": Area.parse, "lever_arm": parse_lever_arm}
     values |= {name: parse[name](values[name]) for name in parse.keys() & values.keys()}
     units = dict.fromkeys(("height", "height_sd", "lever_arm"), "_m") | {"stamp_offset": "_s"}
     return TrackSettings(**{name + units.get(name, ""): value for name, value in values.items()})
