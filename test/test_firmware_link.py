@@ -15,7 +15,7 @@ from benchmarks.equipment.board import Board
 from benchmarks.equipment.emulated_board import EMULATED
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.embedded.compiled import link
-from uwb_mitigation.mitigation.embedded.compiling import firmware_folder
+from uwb_mitigation.mitigation.embedded.compiling import BOARD, firmware_folder
 from uwb_mitigation.mitigation.embedded.export import export_bundle
 from uwb_mitigation.mitigation.model.bundle import Bundle
 from uwb_mitigation.radios.wire import messages
@@ -74,9 +74,7 @@ def library(bundle: Bundle, tmp_path_factory: pytest.TempPathFactory) -> ctypes.
     folder = tmp_path_factory.mktemp("board")
     export_bundle(bundle, folder)
     program = firmware_folder() / "test" / "native_board.c"
-    library = ctypes.CDLL(
-        str(link(program, folder, folder / "board.so", SANITIZED, firmware_models.BOARD, shared=True))
-    )
+    library = ctypes.CDLL(str(link(program, folder, folder / "board.so", SANITIZED, BOARD, shared=True)))
     size, time, pointer, data = ctypes.c_size_t, ctypes.c_uint64, ctypes.c_void_p, ctypes.c_char_p
     for name, result, *arguments in (
         ("board_new", pointer, ctypes.c_int, ctypes.c_int, size),
