@@ -30,6 +30,8 @@ pytestmark = NEEDS_CXX
 
 T = TypeVar("T")
 
+QUICK = ("-O1",)
+
 EXAMPLES = Path(__file__).parent.parent / "firmware" / "examples"
 SKETCH = EXAMPLES / "UwbMitigation"
 STUB = firmware_folder() / "test" / "arduino_stub"
@@ -60,7 +62,7 @@ def mitigation_sketch(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return UwbMitigation, compiled."""
     folder = tmp_path_factory.mktemp("sketch")
     export_bundle(load_bundle(default_model_path()), folder)
-    files = (str(STUB / "main.cpp"), *library_objects(), "-Wl,--wrap=uwb_network", "-lm")
+    files = (str(STUB / "main.cpp"), *library_objects(QUICK), "-Wl,--wrap=uwb_network", "-lm")
     return compile_sketch("UwbMitigation", folder, "gnu++14", *files)
 
 
@@ -177,7 +179,7 @@ def radio_sketch(
     folder = tmp_path_factory.mktemp("radio")
     if request.param:
         export_bundle(load_bundle(default_model_path()), folder)
-    files = (str(STUB / "radio_main.cpp"), *library_objects(), *model_objects(), "-lm", "-lpthread")
+    files = (str(STUB / "radio_main.cpp"), *library_objects(QUICK), *model_objects(), "-lm", "-lpthread")
     return compile_sketch("UwbRanger", folder, "gnu++17", *files), request.param
 
 
