@@ -31,7 +31,6 @@ SCALE = ((0.0, 0.25), (32.0, 0.375), (64.0, 1.5), (256.0, 40.0))
 
 
 def bits(values: ArrayLike) -> NDArray[np.uint32]:
-    """Return the bit patterns of values in binary32."""
     return np.asarray(values, np.float32).view(np.uint32)
 
 

@@ -61,7 +61,6 @@ def test_table_shows_the_rows_of_the_json_result_and_omits_optional_columns(monk
 
 
 def commands(command: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
-    """Yield the words of each command."""
     yield path
     for name, subcommand in getattr(command, "commands", {}).items():
         yield from commands(subcommand, (*path, name))

@@ -18,7 +18,6 @@ from uwb_mitigation.mitigation.model.bundle import Session
 
 @pytest.fixture(autouse=True)
 def no_ports(monkeypatch: pytest.MonkeyPatch):
-    """Ignore the ports of this computer."""
     monkeypatch.setattr(list_ports, "comports", list)
 
 

@@ -59,7 +59,6 @@ def test_sketch_contains_the_shipped_model(tmp_path: Path):
 
 @pytest.fixture(scope="module")
 def mitigation_sketch(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return UwbMitigation, compiled."""
     folder = tmp_path_factory.mktemp("sketch")
     export_bundle(load_bundle(default_model_path()), folder)
     files = (str(STUB / "main.cpp"), *library_objects(QUICK), "-Wl,--wrap=uwb_network", "-lm")
@@ -111,7 +110,6 @@ def received_messages(stream: bytes) -> list[object]:
 
 
 def of_type(kind: type[T], received: list[object]) -> list[T]:
-    """Return the messages of one type."""
     return [message for message in received if isinstance(message, kind)]
 
 
