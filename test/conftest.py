@@ -127,7 +127,6 @@ def apartment_imported(apartment: Path, tmp_path_factory: pytest.TempPathFactory
 
 @pytest.fixture(scope="session")
 def apartment_reading(apartment_imported: Path) -> list[Record]:
-    """Return all exchanges of the real logs."""
     return list(McapRecording(apartment_imported / "apartment.mcap"))
 
 

@@ -26,15 +26,11 @@ from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
 from uwb_mitigation.types.measurement import Cir, Encoding, RangeMeasurement
 
 MODEL_ID = 0x1234ABCD
-BOARD = "uwb_[bcfklnp]*.c"
-"""Sources of a board without the driver of its radio."""
-
 SCALE = ((0.0, 0.25), (32.0, 0.375), (64.0, 1.5), (256.0, 40.0))
 """For the random networks, whose outputs are large."""
 
 
 def bits(values: ArrayLike) -> NDArray[np.uint32]:
-    """Return the bit patterns of values in binary32."""
     return np.asarray(values, np.float32).view(np.uint32)
 
 

@@ -48,7 +48,7 @@ def test_program_on_the_page_prints_the_shown_output(tmp_path: Path):
     source = tmp_path / "blink.c"
     source.write_text(text, encoding="utf-8")
     program, sources = str(tmp_path / "blink"), (*MODEL_FOLDER.glob("*.c"), source)
-    options = ("-std=c11", "-O1", "-g", "-fsanitize=address,undefined", *WARNINGS, f"-I{MODEL_FOLDER}")
+    options = ("-std=c11", "-O1", "-fsanitize=address,undefined", *WARNINGS, f"-I{MODEL_FOLDER}")
     run_tool([*c_compiler(), *options, *map(str, sources), "-lm", "-lpthread", "-o", program])
     done = subprocess.run([program], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines() == [promise] * 2

@@ -22,7 +22,7 @@ from uwb_mitigation.types.ros import codec
 
 def test_info_shows_the_contents_of_a_bag(tmp_path: Path) -> None:
     write_bag(tmp_path / "bag.mcap", 6, simulated="true")
-    done = start("data", "info", "bag.mcap", "--json", "info.json", folder=tmp_path)
+    done = start("data info bag.mcap --json info.json", folder=tmp_path)
     assert done.returncode == 0, done.stderr
     for shown in ("simulated", "6 ranges", "2 pairs", "NDP NLOS", "6.500", "7.000", "50.0"):
         assert shown in done.stdout
@@ -36,8 +36,7 @@ def test_info_shows_the_contents_of_a_bag(tmp_path: Path) -> None:
 def test_import_joins_recordings_and_keeps_the_simulated_mark(tmp_path: Path) -> None:
     write_bag(tmp_path / "one.mcap", 6, simulated="true")
     write_bag(tmp_path / "two", 3, simulated="true")
-    done = start("data", "import", "one.mcap", "two", "-o", "out", "--json", "import.json", folder=tmp_path)
-    assert done.returncode == 0, done.stderr
+    succeed("data import one.mcap two -o out --json import.json", folder=tmp_path)
     bag = BagReader(tmp_path / "out")
     assert bag.message_count == 18
     assert bag.metadata["uwb_mitigation"]["simulated"] == "true"

@@ -60,7 +60,6 @@ FRAME = struct.Struct("<2s B H Q Q 2B 2I 15s")
 
 
 def frame(kind: int, poll: SimpleNamespace, anchor: int, stamps: tuple[int, ...] = (0, 0, 0)) -> list[int]:
-    """Return a frame that answers a poll."""
     ids = poll.tag & 0xFF, poll.pan, poll.source, OTHERS
     ticks = b"".join(stamp.to_bytes(5, "little") for stamp in stamps)
     return list(FRAME.pack(b"\x41\xcc", *ids, 0x75, kind, poll.tag, anchor, ticks))

@@ -62,7 +62,6 @@ DAMAGED = {
 
 
 def accuracy(mitigation: Mitigation, records: list[Record], change: Callable[[Cir], Cir]) -> Accuracy:
-    """Return the accuracy on records with changed CIRs."""
     return evaluate_accuracy(mitigation, [changed(one, change(one.measurement.cir)) for one in records])
 
 

@@ -19,14 +19,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from compilers import NEEDS_CC
+from port_events import driver_values
 from typer.testing import CliRunner
 
 from benchmarks.equipment.dw1000_model.evb1000 import EmulatedEvb1000s
 from benchmarks.equipment.emulated_board import PseudoTerminal
+from benchmarks.equipment.text_board import TextBoards
 from benchmarks.equipment.uci_board import EmulatedUciBoards, UciFaults
 from uwb_mitigation.commands import cli, field_report
 from uwb_mitigation.commands.field.checks import Observation, Verdict, run_checks
-from uwb_mitigation.radios import uci
+from uwb_mitigation.radios import lines, uci
+from uwb_mitigation.radios.evb1000 import Evb1000Bus
 from uwb_mitigation.recordings.mcap import McapRecording
 from uwb_mitigation.types.measurement import Cir, RangeMeasurement
 
@@ -115,8 +118,25 @@ def test_faults_of_uci_boards_are_detected_and_nobody_has_to_unplug_one(
     assert (recovery["verdict"], recovery["value"]) == ("warning", "not unplugged")
 
 
+def test_board_without_cirs_has_no_check_of_them(report: Report, tmp_path: Path):
+    with TextBoards(links=tmp_path / "pans", distance_m=3.0):
+        checks = report("pans", 1, "--no-unplug", "--seconds", "3")
+    assert not failed(checks)
+    assert "share of ranges with CIR" not in checks
+    assert checks["ids"]["value"] == "tag 1, anchor 558"
+    with zipfile.ZipFile(tmp_path / "out.zip") as archive:
+        archive.extract("capture.txt", tmp_path)
+    assert len(list(lines.open_capture(tmp_path / "capture.txt", driver_values(source="lines")))) > 10
+
+
 @NEEDS_CC
-def test_only_the_low_supply_of_good_evb1000s_fails(report: Report, tmp_path: Path):
+def test_only_the_low_supply_of_good_evb1000s_fails(
+    report: Report, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    # On a busy machine, the emulated boards answer too late for the delays of real ones.
+    monkeypatch.setattr(Evb1000Bus, "reply_us", 100_000)
+    monkeypatch.setattr(Evb1000Bus, "timeout_us", 400_000)
+    monkeypatch.setattr(field_report, "_write", lambda *_: None)
     with EmulatedEvb1000s(None, port_links=tmp_path / "evb1000") as boards:
         boards._boards[0].chip.set_environment(30.0, 2.6)
         # On a busy machine, the emulated boards answer some requests too late: each check passes once, and rarely all together.

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import command_line
 import firmware_models
-import model_material
 import numpy as np
 import pytest
 from firmware_models import bits
@@ -91,14 +90,13 @@ def check_corrections(
         image, measurements, bundle.card.architecture.samples, offset_m=offset_m
     )
     assert result.model_id == bundle.model_id
-    mitigation = Mitigation(bundle, Offsets(offset_m))
-    for measured, row in zip(measurements, result.records, strict=True):
-        expected = mitigation.correct([measured])[0]
+    corrected = Mitigation(bundle, Offsets(offset_m)).correct(measurements)
+    faults, windows = bundle.card.preprocessing.windows_of(measurements)
+    for expected, fault, window, row in zip(corrected, faults, windows, result.records, strict=True):
         assert row["range_status"] == int(expected.status)
         values = [expected.range_m, expected.correction_m, expected.variance_m2]
         computed = [row["range_m"], row["correction_m"], row["variance_m2"]]
         assert np.array_equal(bits(np.array(computed)), bits(np.array(values)))
-        fault, window = model_material.window_of(measured.cir, bundle.card.preprocessing)
         if not fault:
             assert np.array_equal(bits(row["window"]), bits(window))
     return set(result.records["range_status"].tolist())

@@ -20,8 +20,8 @@ from benchmarks.equipment import random_networks
 from uwb_mitigation.errors import MissingDependencyError, UwbMitigationError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.embedded import compiling
-from uwb_mitigation.mitigation.embedded.compiled import CORRECTION, CompiledFirmware, FirmwareMitigation, link
-from uwb_mitigation.mitigation.embedded.compiling import firmware_folder, run_tool
+from uwb_mitigation.mitigation.embedded.compiled import CompiledFirmware, FirmwareMitigation, link
+from uwb_mitigation.mitigation.embedded.compiling import BOARD, CORRECTION, firmware_folder, run_tool
 from uwb_mitigation.mitigation.embedded.export import export_bundle
 from uwb_mitigation.mitigation.model import graph
 from uwb_mitigation.mitigation.model.architecture import HEAD
@@ -72,11 +72,11 @@ def test_overflowing_prediction_is_a_model_error_as_in_the_mitigator(sign: int, 
 
 def build_program(name: str, export: Path, flags: Sequence[str] = ()) -> str:
     """Compile a program of `firmware/test/` with the model in `export`."""
-    sources = {"fuzz_link": firmware_models.BOARD, "fuzz_radio": "uwb_[dt]*.c"}.get(name, CORRECTION)
+    sources = {"fuzz_link": BOARD, "fuzz_radio": "uwb_[dt]*.c"}.get(name, CORRECTION)
     return str(link(firmware_folder() / "test" / f"{name}.c", export, export / name, flags, sources))
 
 
-ADDRESS_SANITIZED = ("-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+ADDRESS_SANITIZED = ("-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 
 
 def test_golden_vectors_pass_under_the_sanitizers_and_detect_a_changed_weight(tmp_path: Path):
@@ -162,8 +162,10 @@ def test_firmware_equals_the_ranges_of_onnx_runtime(options: dict | None, tmp_pa
     offsets = Offsets(0.22, {1: 0.1, 2: 0.3}, {1: -0.05, 2: 0.0}, {(2, 3): 2.5})
     firmware, mitigation = FirmwareMitigation(bundle, offsets), Mitigation(bundle, offsets)
     statuses = set()
-    for computed, measurement in zip(firmware.correct(measurements), measurements, strict=True):
-        assert repr(computed) == repr(mitigation.correct([measurement])[0])
+    for computed, expected in zip(
+        firmware.correct(measurements), mitigation.correct(measurements), strict=True
+    ):
+        assert repr(computed) == repr(expected)
         statuses.add(computed.status)
     assert statuses >= {Status.NO_CIR, Status.BAD_CIR, Status.OUT_OF_DISTRIBUTION}
     assert any(status.is_corrected for status in statuses)

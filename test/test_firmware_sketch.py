@@ -30,6 +30,8 @@ pytestmark = NEEDS_CXX
 
 T = TypeVar("T")
 
+QUICK = ("-O1",)
+
 EXAMPLES = Path(__file__).parent.parent / "firmware" / "examples"
 SKETCH = EXAMPLES / "UwbMitigation"
 STUB = firmware_folder() / "test" / "arduino_stub"
@@ -57,10 +59,9 @@ def test_sketch_contains_the_shipped_model(tmp_path: Path):
 
 @pytest.fixture(scope="module")
 def mitigation_sketch(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return UwbMitigation, compiled."""
     folder = tmp_path_factory.mktemp("sketch")
     export_bundle(load_bundle(default_model_path()), folder)
-    files = (str(STUB / "main.cpp"), *library_objects(), "-Wl,--wrap=uwb_network", "-lm")
+    files = (str(STUB / "main.cpp"), *library_objects(QUICK), "-Wl,--wrap=uwb_network", "-lm")
     return compile_sketch("UwbMitigation", folder, "gnu++14", *files)
 
 
@@ -109,7 +110,6 @@ def received_messages(stream: bytes) -> list[object]:
 
 
 def of_type(kind: type[T], received: list[object]) -> list[T]:
-    """Return the messages of one type."""
     return [message for message in received if isinstance(message, kind)]
 
 
@@ -177,7 +177,7 @@ def radio_sketch(
     folder = tmp_path_factory.mktemp("radio")
     if request.param:
         export_bundle(load_bundle(default_model_path()), folder)
-    files = (str(STUB / "radio_main.cpp"), *library_objects(), *model_objects(), "-lm", "-lpthread")
+    files = (str(STUB / "radio_main.cpp"), *library_objects(QUICK), *model_objects(), "-lm", "-lpthread")
     return compile_sketch("UwbRanger", folder, "gnu++17", *files), request.param
 
 

@@ -228,7 +228,6 @@ def test_models_and_firmware_backend_need_no_checkout(tmp_path: Path):
 
 
 def imported(paths: Iterable[Path]) -> set[str]:
-    """Return the top-level packages that files import."""
     texts = (path.read_text(encoding="utf-8") for path in paths)
     return {name for text in texts for name in re.findall(r"^ *(?:from|import) (\w+)", text, re.MULTILINE)}
 

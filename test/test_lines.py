@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import signal
 import socket
 import time
 import tracemalloc
-import zipfile
 from functools import partial
 from pathlib import Path
 
@@ -16,12 +14,10 @@ import pytest
 import ros_harness
 from port_events import PortEvents, driver_values, wait_until
 from ros_harness import diagnostic_values
-from typer.testing import CliRunner
 from uwb_mitigation_msgs.msg import Cir, RangeCir
 
 from benchmarks.equipment.emulated_board import PseudoTerminal
 from benchmarks.equipment.text_board import KINDS, PansShell, TextBoards
-from uwb_mitigation.commands import cli
 from uwb_mitigation.errors import DamagedRecordingError, RecordingError
 from uwb_mitigation.mitigation.model.choice import CirKind, choose_model
 from uwb_mitigation.mitigation.model.shipped import load_model
@@ -312,17 +308,3 @@ def test_driver_publishes_the_ranges_of_two_dwm1001s(
     raw.clear()
     ros.start("driver", "source:=pans", f"path:={tmp_path}/c_2.txt", "rate:=20.0")
     ros.spin_until(lambda: len(raw) > 40)
-
-
-def test_field_report_of_a_board_without_cirs(tmp_path: Path):
-    command = f"field-report --source pans --port {tmp_path}/b0 --distance 3 --seconds 3 --no-unplug"
-    files = f"-o {tmp_path}/out.zip --json {tmp_path}/out.json"
-    with TextBoards(links=tmp_path / "b", distance_m=3.0):
-        result = CliRunner().invoke(cli.app, f"{command} {files}".split())
-    checks = {check["name"]: check for check in json.loads((tmp_path / "out.json").read_text())["checks"]}
-    assert [name for name, check in checks.items() if check["verdict"] == "fail"] == [], result.output
-    assert "share of ranges with CIR" not in checks
-    assert checks["ids"]["value"] == "tag 1, anchor 558"
-    with zipfile.ZipFile(tmp_path / "out.zip") as archive:
-        archive.extract("capture.txt", tmp_path)
-    assert len(list(lines.open_capture(tmp_path / "capture.txt", value_of()))) > 10

@@ -286,8 +286,6 @@ def test_clock_is_synchronised_quickly_and_then_every_second():
 
 
 class OffsetsOnly:
-    """Corrects only the offset."""
-
     offsets = Offsets(9.0)
 
     def correct(self, measurements: list[RangeMeasurement]) -> list[CorrectedRange]:

@@ -206,7 +206,7 @@ class ModelledAir:
 def _library() -> ctypes.CDLL:
     firmware = firmware_folder()
     program = Path(__file__).with_name("radio_air.c")
-    options = ("-std=c99", "-O2", "-fPIC", *WARNINGS, f"-I{MODEL_FOLDER}", f"-I{firmware / 'src'}")
+    options = ("-std=c99", "-O1", "-fPIC", *WARNINGS, f"-I{MODEL_FOLDER}", f"-I{firmware / 'src'}")
     objects = compile_objects(c_compiler(), options, (program, *sorted((firmware / "src").glob("*.c"))))
     air, board = c_void_p, c_int
     signatures: Signatures = {

@@ -14,7 +14,7 @@ from uwb_mitigation.mitigation.embedded.compiling import (
     load_library,
 )
 
-_OPTIONS = ("-std=c11", "-O2", "-fPIC", *WARNINGS)
+_OPTIONS = ("-std=c11", "-O1", "-fPIC", *WARNINGS)
 
 
 class PairConfig(ctypes.Structure):

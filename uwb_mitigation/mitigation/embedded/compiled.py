@@ -22,9 +22,6 @@ from uwb_mitigation.types.measurement import CORRECTED, Cir, CirFault, Corrected
 
 _OPTIONS = ("-std=c99", "-O3", "-fPIC", *compiling.WARNINGS)
 
-CORRECTION = "uwb_[cknp]*.c"
-"""Sources that correct ranges: correct, kernels, network, preprocess. The others are for boards."""
-
 _SHIM = (
     '#include "uwb_model.h"\n'
     "const uwb_model *uwb_exported_model(void);\n"
@@ -78,7 +75,7 @@ class CompiledFirmware:
     def __init__(self, export: Path, build: Path, flags: Sequence[str] = ()) -> None:
         shim = build / "exported_model.c"
         shim.write_text(_SHIM, encoding="utf-8")
-        path = link(shim, export, build / "libuwb_mitigation.so", flags, CORRECTION, shared=True)
+        path = link(shim, export, build / "libuwb_mitigation.so", flags, compiling.CORRECTION, shared=True)
         self._library = compiling.declare(ctypes.CDLL(str(path)), "uwb_", _SIGNATURES)
         self._model = self._library.uwb_exported_model()
         self._arena_bytes: int = self._library.uwb_arena_size(self._model)

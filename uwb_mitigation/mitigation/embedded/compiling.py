@@ -20,6 +20,9 @@ from uwb_mitigation.mitigation.model.shipped import shared_folders
 Signatures = Mapping[str, tuple[object, tuple[object, ...]]]
 WARNINGS = ("-Wall", "-Wextra", "-Wconversion", "-Wpedantic", "-Werror")
 
+CORRECTION, BOARD = "uwb_[cknp]*.c", "uwb_[bcfklnp]*.c"
+"""Sources that correct ranges (correct, kernels, network, preprocess), and these with the protocol of a board. The others drive radios."""
+
 
 def firmware_folder() -> Path:
     """Return the folder `firmware/`: complete in a checkout, an installation contains only the sources.
@@ -50,17 +53,20 @@ def c_compiler() -> tuple[str, ...]:
     return words
 
 
-@functools.cache
 def compile_objects(
     compiler: tuple[str, ...], options: tuple[str, ...], sources: tuple[Path, ...]
 ) -> tuple[str, ...]:
-    """Compile sources once per process, because many models are linked with the same library."""
-    folder = tempfile.mkdtemp(prefix="uwb_firmware_objects_")
+    """Compile sources, each once per process, because many models are linked with the same library."""
+    return tuple(_compile_object(compiler, options, source) for source in sources)
+
+
+@functools.cache
+def _compile_object(compiler: tuple[str, ...], options: tuple[str, ...], source: Path) -> str:
+    folder = tempfile.mkdtemp(prefix="uwb_firmware_object_")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    objects = tuple(f"{folder}/{source.name}.o" for source in sources)
-    for source, output in zip(sources, objects, strict=True):
-        run_tool([*compiler, *options, "-c", str(source), "-o", output])
-    return objects
+    output = f"{folder}/{source.name}.o"
+    run_tool([*compiler, *options, "-c", str(source), "-o", output])
+    return output
 
 
 def load_library(prefix: str, objects: Sequence[str], signatures: Signatures) -> ctypes.CDLL:

@@ -9,7 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from uwb_mitigation.errors import MissingDependencyError
-from uwb_mitigation.mitigation.embedded.compiling import WARNINGS, compile_objects, firmware_folder, run_tool
+from uwb_mitigation.mitigation.embedded.compiling import (
+    BOARD,
+    CORRECTION,
+    WARNINGS,
+    compile_objects,
+    firmware_folder,
+    run_tool,
+)
 
 APT = "apt install gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm"
 
@@ -29,6 +36,9 @@ class Target(str, enum.Enum):
     QEMU_MPS2 = "qemu_mps2"
     QEMU_MPS2_LINK = "qemu_mps2_link"
     DWM1001_DEV = "dwm1001_dev"
+
+
+_SOURCES = {Target.QEMU_MPS2: CORRECTION, Target.QEMU_MPS2_LINK: BOARD, Target.DWM1001_DEV: "*.c"}
 
 
 class Kernels(str, enum.Enum):
@@ -96,7 +106,7 @@ def compile_image(
     elf = build / f"{program.stem if program else board.value}_{kernels.value}.elf"
     kind = ("-O3", "-DUWB_PORTABLE") if kernels is Kernels.PORTABLE else ("-Os",)
     options = (*_CPU, *_COMMON, *kind, *_WARNINGS, f"-I{library}")
-    layers = (*library.glob("*.c"), *(library / "cortex_m4").glob("*.S"), common / "startup.c")
+    layers = (*library.glob(_SOURCES[board]), *(library / "cortex_m4").glob("*.S"), common / "startup.c")
     objects = compile_objects((f"{_PREFIX}gcc",), options, tuple(sorted(layers)))
     sources = [program] if program else sorted((boards / board.value).glob("*.c"))
     script = common / ("mps2.ld" if board.value.startswith("qemu") else "nrf52832.ld")

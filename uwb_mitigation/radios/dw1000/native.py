@@ -20,7 +20,8 @@ from uwb_mitigation.radios.wire.layout import MAX_PAYLOAD_BYTES, MessageType
 from uwb_mitigation.radios.wire.messages import RadioConfigured
 from uwb_mitigation.types.measurement import RangeMeasurement
 
-_OPTIONS = ("-std=c99", "-O2", "-fPIC", *compiling.WARNINGS)
+# Each start of a driver compiles them, and ranging spends little time in them.
+_OPTIONS = ("-std=c99", "-O1", "-fPIC", *compiling.WARNINGS)
 _RANGED, _FAULT = 1, 2
 
 _loading = threading.Lock()
