@@ -27,9 +27,6 @@ from uwb_mitigation.errors import DatasetError
 
 _DIVERGED = 1e6
 
-_MAX_ROWS = 1 << 15
-"""Rows whose products are in memory at once."""
-
 
 @contextmanager
 def _singular_is_undetermined() -> Iterator[None]:
@@ -102,34 +99,21 @@ class LeastSquares:
         target: NDArray[np.float64] | float,
         weight: NDArray[np.float64] | float,
     ) -> None:
-        """Add n rows: values (n, c) at columns (n, c), targets (n,) and inverse variances (n,); all are broadcast.
-
-        The first columns of all rows are of knots, the same number of last ones are shared.
-        """
+        """Add n rows: values (n, c) at columns (n, c), targets (n,) and inverse variances (n,); all are broadcast."""
         columns, values = np.broadcast_arrays(np.atleast_2d(columns), np.atleast_2d(values))
-        n, rows = self.knots * self.unknowns, len(columns)
+        (rows, width), n, size = columns.shape, self.knots * self.unknowns, len(self._right)
+        starts = np.arange(0, rows * width + 1, width)
         weighted = values * np.broadcast_to(weight, rows)[:, None]
-        added = weighted * np.broadcast_to(target, rows)[:, None]
-        self._right += np.bincount(columns.reshape(-1), added.reshape(-1), len(self._right))
-        own = np.s_[:, : int(np.count_nonzero(columns[:1] < n))]
-        for start in range(0, rows, _MAX_ROWS):
-            part = slice(start, start + _MAX_ROWS)
-            self._add_to_band(columns[part][own], weighted[part][own], values[part][own])
-        shared = np.s_[:, own[1].stop :]
-        if columns[shared].size:
-            weighted_rows = _sparse(weighted, columns, len(self._right))
-            shared_rows = _sparse(values[shared], columns[shared] - n, self.shared)
-            self._border += (weighted_rows.T @ shared_rows).toarray()
-
-    def _add_to_band(
-        self, columns: NDArray[np.intp], weighted: NDArray[np.float64], values: NDArray[np.float64]
-    ) -> None:
-        """Add the products of the unknowns of knots. These sums by index take a third of the time of sparse matrices."""
-        row, column = columns[:, :, None], columns[:, None, :]
-        is_lower = row >= column
-        index = ((row - column) * (self.knots * self.unknowns) + column)[is_lower]
-        products = (weighted[:, :, None] * values[:, None, :])[is_lower]
-        self._band += np.bincount(index, products, self._band.size).reshape(self._band.shape)
+        jacobian, weighted_jacobian = (
+            csr_matrix((factor.reshape(-1), columns.reshape(-1), starts), shape=(rows, size))
+            for factor in (values, weighted)
+        )
+        self._right += weighted_jacobian.T @ np.broadcast_to(target, rows)
+        normal = (weighted_jacobian.T @ jacobian).tocsc()
+        knots = normal[:n, :n]
+        for below in range(min(2 * self.unknowns, n)):
+            self._band[below, : n - below] += knots.diagonal(-below)
+        self._border += normal[:, n:].toarray()
 
     def add_at_knots(
         self,
@@ -202,13 +186,6 @@ class LeastSquares:
         covariance = np.linalg.inv((schur + schur.T) / 2.0) if q else np.zeros((0, 0))
         t = covariance @ (self._right[n:] - border.T @ x)
         return Solution((x - y @ t).reshape(self.knots, b), t, covariance, y, factor)
-
-
-def _sparse(values: NDArray[np.float64], columns: NDArray[np.intp], size: int) -> csr_matrix:
-    """Return the matrix (n, size) with values (n, c) at columns (n, c)."""
-    rows, width = values.shape
-    starts = np.arange(0, rows * width + 1, width)
-    return csr_matrix((values.reshape(-1), columns.reshape(-1), starts), shape=(rows, size))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
