@@ -323,6 +323,8 @@ def test_map_has_heading_ellipse_and_a_legend_of_what_it_contains():
         }
 
     assert legend() == {"raw", "corrected", "true", "OK", "tag", *LOOKS}
+    states = page.document.get_model_by_name("map").legend[1].items
+    assert [item.label.value for item in states] == list(LOOKS)
     assert page.column("map", "ink") == [palette.PAPER, *[palette.NIGHT] * 3], "the selected anchor"
     scene.add_pose("tag_7", Pose(4, 3, 1, 0.4, 0.2, 0.3, 0.5, stamp_s=1003.0))
     page.send("draw")

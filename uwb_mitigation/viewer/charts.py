@@ -51,14 +51,11 @@ SOURCES = {
 """Columns of the data; those of lines begin with the column of the horizontal axis. Glyphs with NaN are not drawn."""
 
 TIPS = {
-    "strip": "age raw corrected true",
-    "history": "age residual rate NLOS",
     "positions": "time error",
-    "cir": "sample magnitude",
     "errors": "left right raw corrected",
     "distribution": "right raw_share corrected_share",
 }
-"""Columns whose values are shown next to the pointer."""
+"""Columns whose values are shown next to the pointer; of other figures, all of the source of the same name."""
 
 TRACE_BEFORE, TRACE_AFTER = 20, 180  # samples before and after the first path
 HEIGHT = 380  # of the map, pixels, so that it is on the first screen
@@ -99,12 +96,12 @@ def new_plots(page: PageState, sources: Mapping[str, ColumnDataSource]) -> dict[
     tips = [("", "@name"), ("x, y", "@x{0.00}, @y{0.00} m")]
     plots["map"].add_tools(models.HoverTool(tooltips=tips, renderers=named))
     # States have a legend of their own, whose height never changes; a report without ranges has no states.
-    (legend,), has_states = plots["map"].legend, math.isfinite(page.trail_s) or len(page.view.scene.pairs) > 0
-    states = [item for item in legend.items if getattr(item.label, "value", "") in LOOKS]
-    legend.items = [item for item in legend.items if item not in states]
-    plots["map"].add_layout(models.Legend(items=states, visible=has_states), "below")
+    marks = [r for r in plots["map"].renderers if r.data_source is sources["states"]]
+    items = [models.LegendItem(label=state, renderers=marks, index=row) for row, state in enumerate(LOOKS)]
+    has_states = math.isfinite(page.trail_s) or len(page.view.scene.pairs) > 0
+    plots["map"].add_layout(models.Legend(items=items, visible=has_states), "below")
     for name, plot in plots.items():
-        finish(plot, *TIPS.get(name, "").split())
+        finish(plot, *TIPS.get(name, SOURCES.get(name, "")).split())
     return plots
 
 
@@ -179,7 +176,7 @@ def _layers() -> dict[str, list[Layer]]:
             ("scatter", "rays", status | {"size": 7, "line_width": 2}),
             ("scatter", "anchors", state),
             # The legend has all states, whatever the anchors have.
-            ("scatter", "states", state | {"legend_group": "health"}),
+            ("scatter", "states", state),
             ("segment", "anchors", fit | {"x0": "x", "y0": "y", "x1": "fit_x", "y1": "fit_y", "line_dash": "dotted"}),
             ("scatter", "anchors", fit | {
                 "x": "fit_x", "y": "fit_y", "marker": "square_x", "size": 13, "fill_color": None,

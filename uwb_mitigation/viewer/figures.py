@@ -21,7 +21,7 @@ from uwb_mitigation.types.measurement import FAULTS, Encoding, Status
 from uwb_mitigation.viewer import palette
 from uwb_mitigation.viewer.charts import SOURCES, TRACE_AFTER, TRACE_BEFORE, new_plots
 from uwb_mitigation.viewer.headline import Positions
-from uwb_mitigation.viewer.histories import HISTORY_S, MAX_RANGE_M, Trail
+from uwb_mitigation.viewer.histories import HISTORY_S, MAX_RANGE_M
 from uwb_mitigation.viewer.palette import BLUE, GREY, NIGHT, PAPER, TrackKind
 from uwb_mitigation.viewer.scene import ERROR_EDGES_M, Scene, finite_or_zero, plain_tag_id, tag_label
 from uwb_mitigation.viewer.state import PageState, columns_of, new_source, set_rows
@@ -178,10 +178,9 @@ class Figures:
             anchor = scene.anchors[identity]
             state, residual_m = page.health.get(identity, (health.SILENT, math.nan))
             name = anchor.name or format_id(identity)
-            label = name[:MAX_LABEL] + (
-                f" {state[0]}" if state not in (health.UNKNOWN, health.SILENT) else ""
-            )
-            fit = math.nan, math.nan
+            label, fit = name[:MAX_LABEL], (math.nan, math.nan)
+            if state not in (health.UNKNOWN, health.SILENT):
+                label += f" {state[0]}"
             if identity in displaced:
                 label += " not here"
                 fit = displaced[identity][1].position[:2]
@@ -207,42 +206,22 @@ class Figures:
         set_rows(self._sources["tags"], rows)
 
     def _draw_tracks(self, scene: Scene) -> None:
-        colours = palette.tag_colours(scene.tags)
-        tracks = [
-            (kind, name, track)
-            for kind in palette.TRACK_STYLES
-            for (name, track_kind), track in scene.tracks.items()
-            if track_kind is kind and len(track.rows)
-        ]
-        state = [
-            (
-                kind,
-                name,
-                len(track.rows),
-                track.last.received_s,
-                math.floor(scene.age_s(track.last)),
-                colours.get(name),
-            )
-            for kind, name, track in tracks
-        ]
-        if self._page.changed("tracks", state):
+        colours, kinds = palette.tag_colours(scene.tags), list(palette.TRACK_STYLES)
+        tracks = [(*key, track) for key, track in scene.tracks.items() if len(track.rows)]
+        tracks.sort(key=lambda item: kinds.index(item[1]))
+        lengths = [(*key, len(track.rows), math.floor(scene.age_s(track.last))) for *key, track in tracks]
+        ends_s = [track.last.received_s for *_, track in tracks]
+        if self._page.changed("tracks", (lengths, ends_s, colours)):
             rows = []
-            for kind, name, track in tracks:
+            for name, kind, track in tracks:
                 (colour, *style), label = palette.TRACK_STYLES[kind], kind.value
                 if kind is TrackKind.CORRECTED:
                     colour, label = colours.get(name, BLUE), scene.track_name
-                rows.append((*self._shown(track, scene).T, colour, *style, label))
-            source = self._sources["tracks"]
-            source.data = columns_of(source, rows)
-
-    def _shown(self, track: Trail, scene: Scene) -> NDArray[np.float32]:
-        """Return x and y of the displayed time of a track, float32 (k, 2)."""
-        poses = track.columns
-        begin = np.searchsorted(
-            poses.received_s, track.last.received_s + scene.age_s(track.last) - self._page.trail_s
-        )
-        table = np.column_stack([poses.received_s, poses.x, poses.y])[begin:]
-        return thinned(table, NO_DATA_S)[:, 1:].astype(np.float32)
+                poses = track.columns
+                begin_s = track.last.received_s + scene.age_s(track.last) - self._page.trail_s
+                line = np.column_stack([poses.received_s, poses.x, poses.y])[poses.received_s >= begin_s]
+                rows.append((*thinned(line, NO_DATA_S)[:, 1:].astype(np.float32).T, colour, *style, label))
+            self._sources["tracks"].data = columns_of(self._sources["tracks"], rows)
 
     def _draw_rays(self, scene: Scene) -> None:
         """Draw rays with statuses from the anchors to the tag of the selected pair."""
@@ -272,8 +251,7 @@ class Figures:
             for xs, ys, limit_m in zip(areas.xs, areas.ys, areas.upper_levels, strict=True):
                 colour = cividis(len(STEPS_M))[STEPS_M.index(limit_m)]
                 rows.append((xs, ys, colour, f"sd \u2264 {limit_m:g} m"))
-        source = self._sources["accuracy"]
-        source.data = columns_of(source, rows)
+        self._sources["accuracy"].data = columns_of(self._sources["accuracy"], rows)
 
     def fit_map(self, scene: Scene) -> None:
         """Fit the view of the map to its current content."""

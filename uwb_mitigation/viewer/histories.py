@@ -28,6 +28,8 @@ STATISTICS, RATE_RANGES = 100, 20
 
 Pair = tuple[int, int]
 """Anchor and tag."""
+LeverArm = tuple[float, float, float]
+"""An antenna in the frame of the robot, m."""
 Column = NDArray[np.float64]
 Values = Any
 """A number of one row, or those of n rows, float64 (n,)."""
@@ -131,6 +133,11 @@ class Pose(NamedTuple):
     sd_m: Values = math.nan
     speed: Values = 0.0
     received_s: Values = math.nan
+
+    def antenna(self, arm: LeverArm) -> Pose:
+        """Return the antenna of a robot whose pose the locator publishes; without a heading, its x and y are those of the antenna."""
+        turned = np.nan_to_num(np.exp(1j * self.heading_rad) * complex(*arm[:2]))
+        return self._replace(x=self.x + turned.real, y=self.y + turned.imag, z=self.z + arm[2])
 
 
 class Trail(Rows[Pose]):

@@ -33,16 +33,9 @@ from uwb_mitigation.types.ros.poses import tag_frame
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import TruePath
 from uwb_mitigation.viewer.feed import DECODERS, SceneUpdater
-from uwb_mitigation.viewer.histories import MAX_RANGE_M, Pair, Pose, Sample, plausible_cir
+from uwb_mitigation.viewer.histories import MAX_RANGE_M, LeverArm, Pair, Pose, Sample, plausible_cir
 from uwb_mitigation.viewer.palette import ATTRIBUTES, TrackKind
-from uwb_mitigation.viewer.scene import (
-    DEFAULT_TAG,
-    MAX_TAGS,
-    Scene,
-    antenna_position,
-    tag_label,
-    tag_name,
-)
+from uwb_mitigation.viewer.scene import DEFAULT_TAG, MAX_TAGS, Scene, tag_label, tag_name
 
 BATCH = 64
 """Number of messages that are read ahead to correct their ranges in one call."""
@@ -281,24 +274,21 @@ def _no_ranges(path: Path, types: dict[str, str]) -> RecordingError:
     )
 
 
-def add_residuals(
-    scene: Scene, anchors: AnchorMap, lever_arms: Mapping[str, tuple[float, float, float]] = {}
-) -> None:
+def add_residuals(scene: Scene, anchors: AnchorMap, lever_arms: Mapping[str, LeverArm] = {}) -> None:
     """Set the residuals of ranges: NaN without a recent position, or if the anchor is not in the map; see `Scene.lever_arms`."""
     place = {anchor.id: anchor.position for anchor in anchors.anchors}
-    tracks = {name: trail.rows for (name, kind), trail in scene.tracks.items() if kind is TrackKind.CORRECTED}
+    tracks = {name: track for (name, kind), track in scene.tracks.items() if kind is TrackKind.CORRECTED}
     for (anchor_id, tag_id), history in scene.pairs.items():
         track, columns = tracks.get(tag_name(tag_id, tracks, scene.pairs)), history.columns
         if track is None or anchor_id not in place:
             continue
-        poses = Pose(*track[np.argsort(Pose(*track.T).stamp_s, kind="stable")].T)
-        arm, position, at_s = lever_arms.get(format_id(tag_id)), np.stack(poses[:3], axis=1), poses.stamp_s
-        if arm is not None:
-            position = antenna_position(position, poses.heading_rad, arm)
-        x, y, z = (np.interp(columns.stamp_s, at_s, axis) for axis in position.T)
+        poses = Pose(*track.rows[np.argsort(track.columns.stamp_s, kind="stable")].T)
+        if (arm := lever_arms.get(format_id(tag_id))) is not None:
+            poses = poses.antenna(arm)
+        x, y, z = (np.interp(columns.stamp_s, poses.stamp_s, axis) for axis in poses[:3])
         distance_m = np.linalg.norm(np.column_stack([x, y, np.nan_to_num(z)]) - place[anchor_id], axis=1)
-        latest = np.maximum(np.searchsorted(at_s, columns.stamp_s, side="right") - 1, 0)
-        is_recent = np.abs(columns.stamp_s - at_s[latest]) < NO_DATA_S
+        latest = np.maximum(np.searchsorted(poses.stamp_s, columns.stamp_s, side="right") - 1, 0)
+        is_recent = np.abs(columns.stamp_s - poses.stamp_s[latest]) < NO_DATA_S
         columns.residual_m[:] = np.where(is_recent, columns.corrected_m - distance_m, np.nan)
 
 

@@ -33,6 +33,7 @@ from uwb_mitigation.viewer.histories import (
     MAX_SAMPLES,
     BoundedDict,
     History,
+    LeverArm,
     Outages,
     Pair,
     Pose,
@@ -143,7 +144,7 @@ class Scene:
         self.ranges = self.corrected = self.faults = self.dropped = 0
         self.pairs: BoundedDict[Pair, History] = BoundedDict(math.inf if self.is_whole else MAX_PAIRS)
         self.tags: BoundedDict[str, Pose] = BoundedDict(MAX_TAGS)
-        self.lever_arms: BoundedDict[str, tuple[float, float, float]] = BoundedDict(MAX_TAGS)
+        self.lever_arms: BoundedDict[str, LeverArm] = BoundedDict(MAX_TAGS)
         # {tag: (filter of its raw ranges, stamp of the last pose whose height it got)}
         self._raw_locators: BoundedDict[int, tuple[TagEstimator, float]] = BoundedDict(MAX_TAGS)
         self.tracks: BoundedDict[tuple[str, TrackKind], Trail] = BoundedDict(4 * MAX_TAGS)
@@ -303,8 +304,7 @@ class Scene:
         if pose is None or anchor is None or self.age_s(pose) > NO_DATA_S:
             return math.nan
         if (arm := self.lever_arms.get(format_id(pair[1]))) is not None:
-            x, y, z = antenna_position(np.array(pose[:3]), pose.heading_rad, arm).tolist()
-            pose = pose._replace(x=x, y=y, z=z)
+            pose = pose.antenna(arm)
         self._locate_raw(pair, pose, sample)
         # On a busy computer, positions arrive late.
         if abs(pose.stamp_s - sample.stamp_s) * pose.speed > MAX_MOVED_M:
@@ -374,23 +374,6 @@ class Scene:
     def tag_of(self, tag_id: int) -> Pose | None:
         """Return the position of the tag of a range; None: it has none."""
         return self.tags.get(tag_name(tag_id, self.tags, self.pairs))
-
-
-def antenna_position(
-    position: NDArray[np.float64],
-    heading_rad: NDArray[np.float64] | float,
-    arm: tuple[float, float, float],
-) -> NDArray[np.float64]:
-    """Return positions of an antenna, float64 (..., 3), m, from those of a robot as the locator publishes them.
-
-    Without a heading (NaN), their x and y are those of the antenna.
-    """
-    x, y, z = arm
-    turned = np.nan_to_num(np.exp(1j * np.asarray(heading_rad)) * complex(x, y))
-    result: NDArray[np.float64] = position + np.stack(
-        [turned.real, turned.imag, np.full(turned.shape, z)], axis=-1
-    )
-    return result
 
 
 def plain_tag_id(names: Container[str], pairs: Iterable[Pair]) -> int | None:
