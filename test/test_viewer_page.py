@@ -20,9 +20,9 @@ from benchmarks.equipment.page_clients import PageClients
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.types.anchors import Anchor
 from uwb_mitigation.types.measurement import Cir, Encoding, Status
-from uwb_mitigation.viewer.histories import Sample
+from uwb_mitigation.viewer.histories import Pose, Sample
 from uwb_mitigation.viewer.palette import TrackKind
-from uwb_mitigation.viewer.scene import NodeStatus, Pose, Scene
+from uwb_mitigation.viewer.scene import NodeStatus, Scene
 from uwb_mitigation.viewer.server import ViewerServer
 from uwb_mitigation.viewer.state import View
 
@@ -55,7 +55,7 @@ def view(clock: Clock) -> View:
             true_m, range_m = (5.1, 5.1) if anchor == 1 else (4.8, 5.3)
             scene.add_sample((anchor, 7), Sample(time_s, 5.3, range_m, 0.1, status, true_m))
         scene.add_pose(HOSTILE, Pose(4.0, 3.0, 1.0, stamp_s=time_s), TrackKind.TRUE)
-        scene.add_pose("tag", Pose(4 + math.sin(step / 20), 3, 1, (0.4, 0.2, 0.3), stamp_s=time_s))
+        scene.add_pose("tag", Pose(4 + math.sin(step / 20), 3, 1, 0.4, 0.2, 0.3, stamp_s=time_s))
     return view
 
 
@@ -192,7 +192,7 @@ def test_implausible_values_do_not_break_the_page(browser: Browser, view: View, 
         for anchor, values in ((1, (3e38, -3e38, inf)), (2, (nan, nan, nan)), (3, (inf, -inf, 0.1))):
             view.scene.add_sample((anchor, 7), Sample(1005.0, *values, Status.BAD_CIR, 3e38))
             view.scene.add_sample((anchor, 7), Sample(1005.0, *values, Status.BAD_CIR, 5.0))
-        view.scene.add_pose("tag", Pose(4, 3, nan, (1e300, nan, nan)))
+        view.scene.add_pose("tag", Pose(4, 3, nan, 1e300))
         view.scene.add_pose("tag", Pose(1e300, 3, 0))
         view.scene.add_pose("tag", Pose(4.0, -1e300, 0.0, stamp_s=1005.0), TrackKind.TRUE)
     open_page(browser, server)

@@ -88,7 +88,7 @@ def open_bag(
 
 
 def latest(scene: Scene) -> dict[tuple[int, int], float]:
-    return {pair: sample.range_m for pair, _, sample in scene.latest()}
+    return {pair: sample.corrected_m for pair, _, sample in scene.latest()}
 
 
 def test_seek_shows_data_up_to_the_position(bag: Path):
@@ -188,7 +188,7 @@ def test_output_of_track_is_shown(tmp_path: Path):
     assert {name for name, kind in scene.tracks if kind is TrackKind.SMOOTHED} == set(scene.tags)
     assert any("0x1122334455667788" in name for name in scene.tags)
     for view in scene.tracks.values():
-        assert view.rows[-1, 1:3] == pytest.approx(truth.position[-1, :2], abs=0.5)
+        assert view.rows[-1, :2] == pytest.approx(truth.position[-1, :2], abs=0.5)
     assert "without ranges" in scene.missing["ranges"]
     written = load_anchors(anchors_path(track)).anchors
     assert [(anchor.id, anchor.position) for anchor in written] == [(a.id, a.position) for a in HALL.anchors]
@@ -242,7 +242,7 @@ def test_implausible_values_of_standard_messages_are_ignored() -> None:
             header=header, pose=SimpleNamespace(pose=pose, covariance=[covariance] * 36)
         )
         feed.add(POSE, message)
-        assert np.isnan(scene.tags["tag"].ellipse).all()
+        assert np.isnan(scene.tags["tag"][3:6]).all()
     feed.add_encoded(RANGE_RAW, b"")
     assert feed.malformed == 1
 
@@ -290,7 +290,7 @@ def test_index_of_a_drive_has_tracks_errors_and_residuals(tmp_path: Path, monkey
     assert done.returncode == 0, done.stderr
     anchors = load_anchors(anchors_path(bag))
     player, scene = open_bag(bag, anchors)
-    timeline, whole = player.timeline, player.timeline.scene
+    timeline = whole = player.timeline
     assert whole.ranges == sum(1 for _ in BagReader(bag).messages([RANGE_RAW]))
     figures = {title: (value, text) for title, value, text in cards(View(scene, player=player), 101)}
     corrected, references = figures["Position RMSE, whole recording"]

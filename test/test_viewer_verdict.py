@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Iterable
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from browser import Browser
 from drawn import Clock, Drawn
+from PIL import Image
 
 from uwb_mitigation.positioning import health
 from uwb_mitigation.positioning.geometry import dop
@@ -17,10 +20,11 @@ from uwb_mitigation.types.anchors import Anchor
 from uwb_mitigation.types.measurement import Status
 from uwb_mitigation.viewer import palette
 from uwb_mitigation.viewer.feed import SceneUpdater
-from uwb_mitigation.viewer.histories import Sample
+from uwb_mitigation.viewer.histories import Pose, Sample
 from uwb_mitigation.viewer.incidents import Incidents
 from uwb_mitigation.viewer.palette import TrackKind
-from uwb_mitigation.viewer.scene import NodeStatus, Pose, Scene
+from uwb_mitigation.viewer.scene import NodeStatus, Scene
+from uwb_mitigation.viewer.server import ViewerServer
 from uwb_mitigation.viewer.state import View
 from uwb_mitigation.viewer.verdict import LOOKS, HeldVerdict, predicted_accuracy
 
@@ -77,6 +81,28 @@ def test_anchor_that_reads_long_degrades_the_position_by_its_name():
     assert page.column("map", "label") == ["1 \u2713", "door \u2297 +0.6 m", "3 \u2713", "4 \u2713"]
     assert page.column("map", "health")[1] == health.BAD
     assert page.column("pairs", "state").count(health.BAD) == 1
+
+
+def test_marks_of_anchors_have_the_colours_of_their_states(browser: Browser):
+    scene = driven({2: 0.6, 3: 0.2}, senders=(1, 2, 3))[0]
+    states = health.GOOD, health.BAD, health.CHECK, health.SILENT
+
+    def colours() -> list[str]:
+        """Return the colours of the marks next to their centres."""
+        places = browser.run(
+            "const {frame, el} = Bokeh.index.find_one(Bokeh.documents[0].get_model_by_name('map'));"
+            "const {left, top} = el.getBoundingClientRect();"
+            "return arguments[0].map(([x, y]) => [left + frame.x_scale.compute(x), top + frame.y_scale.compute(y)])",
+            list(ANCHORS.values()),
+        )
+        screen = Image.open(io.BytesIO(browser.driver.get_screenshot_as_png())).convert("RGB")
+        pixels = [screen.getpixel((round(x) + 3, round(y))) for x, y in places]
+        return ["#" + bytes(pixel).hex() for pixel in pixels]
+
+    with ViewerServer(View(scene), port=0) as server:
+        browser.open(server.url)
+        browser.wait("the page", browser.ready)
+        browser.wait("the marks", lambda: colours() == [LOOKS[state][1] for state in states])
 
 
 def test_anchor_to_check_is_named_below_a_good_position():
@@ -297,8 +323,10 @@ def test_map_has_heading_ellipse_and_a_legend_of_what_it_contains():
         }
 
     assert legend() == {"raw", "corrected", "true", "OK", "tag", *LOOKS}
+    states = page.document.get_model_by_name("map").legend[1].items
+    assert [item.label.value for item in states] == list(LOOKS)
     assert page.column("map", "ink") == [palette.PAPER, *[palette.NIGHT] * 3], "the selected anchor"
-    scene.add_pose("tag_7", Pose(4, 3, 1, (0.4, 0.2, 0.3), 0.5, stamp_s=1003.0))
+    scene.add_pose("tag_7", Pose(4, 3, 1, 0.4, 0.2, 0.3, 0.5, stamp_s=1003.0))
     page.send("draw")
     assert legend() >= {"95 % ellipse", "heading"}
     assert (page.column("map", "heading"), page.column("map", "width")) == ([0.5], [0.8])

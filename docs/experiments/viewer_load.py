@@ -39,8 +39,9 @@ from uwb_mitigation.types.measurement import (
 from uwb_mitigation.types.ros.codec import MeasurementKey, encode_corrected
 from uwb_mitigation.types.ros.topics import RANGE_CORRECTED, RANGE_CORRECTED_TYPE, RANGE_RAW
 from uwb_mitigation.viewer.feed import SceneUpdater
+from uwb_mitigation.viewer.histories import Pose
 from uwb_mitigation.viewer.playback import BagPlayer
-from uwb_mitigation.viewer.scene import Pose, Scene
+from uwb_mitigation.viewer.scene import Scene
 from uwb_mitigation.viewer.server import ViewerServer
 from uwb_mitigation.viewer.state import View
 
@@ -66,11 +67,7 @@ def feed_ranges(feed: SceneUpdater, stop: threading.Event) -> None:
                 feed.scene.add_pose(
                     f"tag_{tag}",
                     Pose(
-                        12 + 8 * np.cos(angle),
-                        9 + 6 * np.sin(angle),
-                        1.0,
-                        (0.5, 0.3, 0.2),
-                        stamp_s=time.time(),
+                        12 + 8 * np.cos(angle), 9 + 6 * np.sin(angle), 1.0, 0.5, 0.3, 0.2, stamp_s=time.time()
                     ),
                 )
         for _ in range(int(RATE_HZ * PERIOD_S)):

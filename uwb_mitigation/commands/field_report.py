@@ -165,8 +165,8 @@ def _page(
 
     from uwb_mitigation.types.measurement import CorrectedBy, CorrectedRange, Status
     from uwb_mitigation.types.ros.codec import measurement_key
+    from uwb_mitigation.viewer.charts import HEADINGS
     from uwb_mitigation.viewer.feed import SceneUpdater
-    from uwb_mitigation.viewer.figures import HEADINGS
     from uwb_mitigation.viewer.report import draw_scene, render_report
     from uwb_mitigation.viewer.scene import Scene
     from uwb_mitigation.viewer.state import View

@@ -28,9 +28,9 @@ from uwb_mitigation.types.ros.codec import (
     measurement_key,
 )
 from uwb_mitigation.types.stamps import NS_PER_S, to_ns
-from uwb_mitigation.viewer.histories import BoundedDict, Sample, plausible_cir
+from uwb_mitigation.viewer.histories import BoundedDict, Pose, Sample, plausible_cir
 from uwb_mitigation.viewer.palette import TrackKind
-from uwb_mitigation.viewer.scene import DEFAULT_TAG, NodeStatus, Pose, Scene
+from uwb_mitigation.viewer.scene import DEFAULT_TAG, NodeStatus, Scene
 
 MAX_WAITING, MAX_WITHOUT_TRUTH = 10_000, 1000
 """Truths and CIRs without corrected ranges, and corrected ranges without truths, that are kept."""
@@ -107,11 +107,9 @@ class SceneUpdater:
             self._without_truth.add(key, None)
         sd_m = math.sqrt(corrected.variance_m2) if corrected.variance_m2 >= 0.0 else math.nan
         measured = corrected.range_raw_m, corrected.range_m, sd_m, corrected.status
-        truth_and_levels = (
-            math.nan if truth is None else truth.range_m,
-            *self._levels.pop(key, (math.nan, math.nan)),
-        )
-        sample = Sample(key.stamp_ns / NS_PER_S, *measured, *truth_and_levels, key.sequence)
+        true_m = math.nan if truth is None else truth.range_m
+        levels = self._levels.pop(key, (math.nan, math.nan))
+        sample = Sample(key.stamp_ns / NS_PER_S, *measured, true_m, *levels, key.sequence)
         self.scene.add_sample((key.anchor_id, key.tag_id), sample)
 
     def _position(self, kind: TrackKind, tag: str, message: Any) -> None:
@@ -126,7 +124,7 @@ class SceneUpdater:
         sd_m = math.sqrt(variance) if 0.0 < variance < math.inf else math.nan
         if 0.0 < covariance[5, 5] < MAX_HEADING_VARIANCE:
             heading_rad = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
-        pose = Pose(x, y, z, horizontal_ellipse(covariance), heading_rad, stamp_s, sd_m)
+        pose = Pose(x, y, z, *horizontal_ellipse(covariance), heading_rad, stamp_s, sd_m)
         self.scene.add_pose(tag, pose, kind)
 
     def markers(self, message: Any) -> None:

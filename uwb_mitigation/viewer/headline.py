@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.positioning.track_errors import NO_ERRORS, TrackErrors, track_errors
 from uwb_mitigation.types.stamps import NS_PER_S
-from uwb_mitigation.types.tracks import Track, TruePath
-from uwb_mitigation.viewer.histories import HISTORY_S
+from uwb_mitigation.types.tracks import TruePath
+from uwb_mitigation.viewer.histories import HISTORY_S, Pose
 from uwb_mitigation.viewer.palette import ATTRIBUTES, TrackKind
 from uwb_mitigation.viewer.scene import DEFAULT_TAG, Scene, tag_label, tag_name
 from uwb_mitigation.viewer.state import View
@@ -61,7 +61,7 @@ class Positions:
 
     def __init__(self, view: View, tag_id: int | None) -> None:
         is_ready, all_data = view.timeline.is_complete, view.all_data
-        self._tracks = {key: track.rows for key, track in all_data.tracks.items()} if is_ready else {}
+        self._tracks = {key: track.columns for key, track in all_data.tracks.items()} if is_ready else {}
         self._names = [name for name, kind in self._tracks if kind is TrackKind.CORRECTED]
         self._is_corrected = view.scene.corrected > 0
         self._name = next(iter(self._names), "")
@@ -70,7 +70,7 @@ class Positions:
         self._frame = tag_label(self._name or DEFAULT_TAG, tag_id).replace(" ", "_")
         self._estimated = view.timeline.estimates.get(self._name) if is_ready else None
 
-    def track(self, kind: TrackKind) -> NDArray[np.float64] | None:
+    def track(self, kind: TrackKind) -> Pose | None:
         """Return the track of a kind; a true track has the frame of the tag as name, or any name if there is only one tag."""
         if kind is not TrackKind.TRUE:
             return self._tracks.get((self._name, kind))
@@ -78,36 +78,31 @@ class Positions:
         is_single = len(true) == len(self._names) == 1
         return next(iter(true.values())) if is_single else true.get(self._frame)
 
-    def _compared(self, kind: TrackKind, begin_s: float) -> tuple[Track, TruePath] | None:
-        """Return a track from a time on and the true path; None: one of them is unknown."""
-        columns, true = self.track(kind), self.track(TrackKind.TRUE)
-        if columns is None or true is None:
+    def _truth(self) -> TruePath | None:
+        """Return the true path; None: it is unknown."""
+        if (true := self.track(TrackKind.TRUE)) is None:
             return None
-        rows = slice(int(np.searchsorted(columns[:, 0], begin_s, side="right")), None)
         if self._estimated is not None and len(self._estimated.recording.truth):
-            # Exact stamps: the same figures as those of `track`.
-            return getattr(self._estimated, ATTRIBUTES[kind]).take(rows), self._estimated.recording.truth
+            return self._estimated.recording.truth
+        order = np.arange(len(true.x))
         # Messages that overtake each other; a longer step back is a replay in a loop.
-        stamp_s = true[:, 5]
-        if (np.maximum.accumulate(stamp_s) - stamp_s < 1.0).all():
-            true = true[np.argsort(stamp_s, kind="stable")]
-        path = _track(true)
-        return _track(columns[rows]), TruePath(path.stamp_ns, path.position * (1.0, 1.0, 0.0))
+        if (np.maximum.accumulate(true.stamp_s) - true.stamp_s < 1.0).all():
+            order = np.argsort(true.stamp_s, kind="stable")
+        return TruePath(_stamp_ns(true.stamp_s[order]), np.stack(true[:3], axis=1)[order])
 
-    def errors(self, kind: TrackKind, begin_s: float) -> TrackErrors:
-        """Return the errors of a track from a time on."""
-        compared = self._compared(kind, begin_s)
-        return NO_ERRORS if compared is None else track_errors(*compared)
-
-    def error_columns(self, kind: TrackKind) -> NDArray[np.float64]:
+    def errors(self, kind: TrackKind) -> NDArray[np.float64]:
         """Return time (s), horizontal error and two standard deviations (m) of each position, float64 (n, 3); NaN: unknown."""
-        if (columns := self.track(kind)) is None:
+        if (poses := self.track(kind)) is None:
             return np.zeros((0, 3))
-        error_m = np.full(len(columns), np.nan)
-        if (compared := self._compared(kind, -math.inf)) is not None:
-            track, truth = compared
-            error_m = np.linalg.norm((track.position - truth.position_at(track.stamp_ns))[:, :2], axis=1)
-        return np.column_stack([columns[:, 0], error_m, 2.0 * columns[:, 4]])
+        error_m = np.full(len(poses.x), np.nan)
+        if (truth := self._truth()) is not None:
+            stamp_ns = _stamp_ns(poses.stamp_s)
+            if self._estimated is not None and truth is self._estimated.recording.truth:
+                # Exact stamps: the same figures as those of `track`.
+                stamp_ns = getattr(self._estimated, ATTRIBUTES[kind]).stamp_ns
+            true = truth.position_at(stamp_ns)
+            error_m = np.hypot(poses.x - true[:, 0], poses.y - true[:, 1])
+        return np.column_stack([poses.received_s, error_m, 2.0 * poses.sd_m])
 
     def cards(self, begin_s: float, window: str) -> list[Card]:
         """Return the figures of the positions from a time on; `window`: name of this interval."""
@@ -115,25 +110,28 @@ class Positions:
         if track is None:
             return []
         if self.track(TrackKind.TRUE) is None:
-            median_m = _metres(track[track[:, 0] > begin_s, 4], np.median)
-            return [[f"Reported standard deviation, {window}", median_m, "median; no true positions"]]
-        errors = {
-            kind: self.errors(kind, begin_s)
-            for kind in (TrackKind.RAW, TrackKind.SMOOTHED)
-            if self.track(kind) is not None
-        }
-        corrected, shown = self.errors(TrackKind.CORRECTED, begin_s), []
-        for title, name in (("Position RMSE", "rmse"), ("95 % of position errors below", "p95")):
-            others = (
-                f"{self._title(kind)}: {_metres(getattr(error, name))}" for kind, error in errors.items()
-            )
-            shown.append([f"{title}, {window}", _metres(getattr(corrected, name)), "; ".join(others)])
-        raw_m = errors.get(TrackKind.RAW, NO_ERRORS).rmse
+            median_m = _statistic(np.median, track.sd_m[track.received_s > begin_s])
+            return [
+                [f"Reported standard deviation, {window}", _metres(median_m), "median; no true positions"]
+            ]
+        kinds = [kind for kind in ATTRIBUTES if self.track(kind) is not None]
+        tables, shown = {kind: self.errors(kind) for kind in kinds}, []
+        errors_m = {kind: table[table[:, 0] > begin_s, 1] for kind, table in tables.items()}
+        rmse, p95 = (
+            {kind: _statistic(statistic, errors_m[kind]) for kind in kinds}
+            for statistic in (lambda of_m: np.sqrt(np.mean(of_m**2)), partial(np.percentile, q=95))
+        )
+        for title, values in (("Position RMSE", rmse), ("95 % of position errors below", p95)):
+            texts = {kind: _metres(value_m) for kind, value_m in values.items()}
+            corrected = texts.pop(TrackKind.CORRECTED)
+            others = "; ".join(f"{self._title(kind)}: {text}" for kind, text in texts.items())
+            shown.append([f"{title}, {window}", corrected, others])
+        corrected_m, raw_m = rmse[TrackKind.CORRECTED], rmse.get(TrackKind.RAW, math.nan)
         # Without corrections, offsets make the difference.
-        if self._is_corrected and corrected.rmse + raw_m > 0.0:
-            percent = 100.0 * (corrected.rmse / raw_m - 1.0)
+        if self._is_corrected and corrected_m + raw_m > 0.0:
+            percent = 100.0 * (corrected_m / raw_m - 1.0)
             change = f"{abs(percent):.0f} % {'more' if percent > 0.0 else 'less'} error"
-            text = f"position RMSE {corrected.rmse:.3f} m; {self._title(TrackKind.RAW)}: {raw_m:.3f} m"
+            text = f"position RMSE {corrected_m:.3f} m; {self._title(TrackKind.RAW)}: {raw_m:.3f} m"
             shown.append([f"Correction, {window}", change if abs(percent) >= 0.5 else "no change", text])
         return shown
 
@@ -144,15 +142,15 @@ class Positions:
         return "raw + default filter" if self._estimated is None else "raw + same filter"
 
 
-def _track(columns: NDArray[np.float64]) -> Track:
-    """Return rows of `Scene.tracks` as a track without covariances."""
-    n = len(columns)
-    stamp_ns = np.rint(columns[:, 5] * NS_PER_S).astype(np.int64)
-    return Track(stamp_ns, columns[:, 1:4], np.zeros((n, 3)), np.full((n, 6, 6), np.nan))
+def _stamp_ns(stamp_s: NDArray[np.float64]) -> NDArray[np.int64]:
+    return np.rint(stamp_s * NS_PER_S).astype(np.int64)
 
 
-def _metres(values_m: Any, statistic: Callable[[NDArray[np.float64]], Any] = np.mean) -> str:
-    """Return a value, or a statistic of the finite values, as text; "-" without any."""
-    finite = np.atleast_1d(values_m)
-    finite = finite[np.isfinite(finite)]
-    return f"{statistic(finite):.3f} m" if len(finite) else "-"
+def _statistic(statistic: Callable[[NDArray[np.float64]], Any], values: NDArray[np.float64]) -> float:
+    """Return a statistic of the finite values; NaN without any."""
+    finite = values[np.isfinite(values)]
+    return float(statistic(finite)) if len(finite) else math.nan
+
+
+def _metres(value_m: float) -> str:
+    return f"{value_m:.3f} m" if math.isfinite(value_m) else "-"

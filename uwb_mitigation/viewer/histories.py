@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections import OrderedDict
+from collections import OrderedDict, namedtuple
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.positioning.health import NO_DATA_INTERVALS, NO_DATA_S
-from uwb_mitigation.types.measurement import FAULTS, LINE_OF_SIGHT_DB, Cir, Encoding, Status
+from uwb_mitigation.types.measurement import FAULTS, LINE_OF_SIGHT_DB, Cir, Encoding
 
 MAX_SAMPLES = 6000
 """Number of ranges of a pair of a stream that are kept: 100 per second for a minute."""
@@ -28,11 +28,15 @@ STATISTICS, RATE_RANGES = 100, 20
 
 Pair = tuple[int, int]
 """Anchor and tag."""
+LeverArm = tuple[float, float, float]
+"""An antenna in the frame of the robot, m."""
 Column = NDArray[np.float64]
+Values = Any
+"""A number of one row, or those of n rows, float64 (n,)."""
 
 K = TypeVar("K")
 V = TypeVar("V")
-R = TypeVar("R", bound="Rows")
+R = TypeVar("R", bound="Rows[Any]")
 
 
 class BoundedDict(OrderedDict[K, V]):
@@ -54,15 +58,21 @@ class BoundedDict(OrderedDict[K, V]):
         return value
 
 
-class Rows:
-    """Rows of float64 in the order in which they are added; the first column is the time of reception on the scene's clock.
+class Rows(Generic[V]):
+    """Rows of float64 in the order in which they are added; the last column is the time of reception on the scene's clock.
 
     Args:
-        rows: float64 (n, k).
+        rows: float64 (n, k); None: without rows.
+
+    Attributes:
+        kind: named tuple of one row, or of all columns.
     """
 
-    def __init__(self, rows: NDArray[np.float64]) -> None:
-        self._data, self._begin, self._end = rows, 0, len(rows)
+    kind: Any
+
+    def __init__(self, rows: NDArray[np.float64] | None = None) -> None:
+        self._data = np.empty((0, len(self.kind._fields))) if rows is None else rows
+        self._begin, self._end = 0, len(self._data)
 
     @property
     def rows(self) -> NDArray[np.float64]:
@@ -70,15 +80,18 @@ class Rows:
         return self._data[self._begin : self._end]
 
     @property
-    def last(self) -> list[Any]:
-        """The values of the last row; NaN: there is none."""
-        has_rows = self._end > self._begin
-        return list(self._data[self._end - 1].tolist()) if has_rows else [math.nan] * self._data.shape[1]
+    def columns(self) -> V:
+        """The columns; a change of a value is kept."""
+        columns: V = self.kind(*self.rows.T)
+        return columns
 
     @property
-    def received_s(self) -> float:
-        """Time of reception of the last row; NaN: there is none."""
-        return float(self.last[0])
+    def last(self) -> V:
+        """The last row; NaN: there is none."""
+        has_rows = self._end > self._begin
+        values = self._data[self._end - 1].tolist() if has_rows else [math.nan] * self._data.shape[1]
+        last: V = self.kind(*values)
+        return last
 
     def append(self, row: Sequence[float], limit: int | None = None) -> None:
         """Append a row, and remove the first ones above a limit."""
@@ -94,53 +107,75 @@ class Rows:
 
     def until(self: R, end_s: float, begin_s: float = -math.inf) -> R:
         """Return the rows that were received in an interval; at least the last one before its end."""
-        received_s = self.rows[:, 0]
+        received_s = self.rows[:, -1]
         end = bisect_right(received_s, end_s + 1e-6)
         begin = max(min(bisect_right(received_s, begin_s), end - 1), 0)
         return type(self)(self.rows[begin:end])
 
 
-class RangeColumns(NamedTuple):
-    """Ranges of one pair, each float64 (n,), live and recorded; NaN: unknown.
+class Pose(NamedTuple):
+    """Estimated position of a tag, or positions, m; NaN: unknown.
 
     Attributes:
-        received_s: time of reception on the scene's clock.
-        residual_m: corrected range minus the distance of the anchor from the estimated position.
-        interval_s: time since the previous range of the pair; NaN: unknown, because the viewer has dropped ranges.
-        raw_m, corrected_m, sigma_m: measured and corrected range, and standard deviation of the corrected one.
-        true_m: true range, which may arrive later.
-        gap_db: level of the CIR above that of its first path. rx_dbm: its receive level.
+        major_m, minor_m, angle_rad: half axes of the horizontal 95 % ellipse, and angle of the major one.
+        stamp_s, sd_m: time of the estimate, s, and horizontal standard deviation.
+        speed: m/s, from the pose before; `Scene.add_pose` sets it, and the time of reception on the scene's clock.
     """
 
-    received_s: Column
-    residual_m: Column
-    interval_s: Column
-    stamp_s: Column
-    raw_m: Column
-    corrected_m: Column
-    sigma_m: Column
-    status: Column
-    true_m: Column
-    gap_db: Column
-    rx_dbm: Column
-    sequence: Column
+    x: Values
+    y: Values
+    z: Values = math.nan
+    major_m: Values = math.nan
+    minor_m: Values = math.nan
+    angle_rad: Values = math.nan
+    heading_rad: Values = math.nan
+    stamp_s: Values = math.nan
+    sd_m: Values = math.nan
+    speed: Values = 0.0
+    received_s: Values = math.nan
+
+    def antenna(self, arm: LeverArm) -> Pose:
+        """Return the antenna of a robot whose pose the locator publishes; without a heading, its x and y are those of the antenna."""
+        turned = np.nan_to_num(np.exp(1j * self.heading_rad) * complex(*arm[:2]))
+        return self._replace(x=self.x + turned.real, y=self.y + turned.imag, z=self.z + arm[2])
 
 
-STAMP = RangeColumns._fields.index("stamp_s")
+class Trail(Rows[Pose]):
+    """Positions of one tag."""
+
+    kind = Pose
+
+
+class Outages(Rows[Any]):
+    """Intervals, by stamps of a tag, in which the viewer has dropped ranges."""
+
+    kind = namedtuple("kind", "begin_s, end_s")
 
 
 class Sample(NamedTuple):
-    """One corrected range of a pair; see `RangeColumns`, whose last fields these are."""
+    """A corrected range of one pair, or ranges, live and recorded; NaN: unknown.
 
-    stamp_s: float
-    raw_m: float
-    range_m: float
-    sigma_m: float
-    status: Status
-    true_m: float = math.nan
-    gap_db: float = math.nan
-    rx_dbm: float = math.nan
-    sequence: int = 0
+    Attributes:
+        raw_m, corrected_m, sigma_m: measured and corrected range, and standard deviation of the corrected one.
+        true_m: true range, which may arrive later.
+        gap_db: level of the CIR above that of its first path. rx_dbm: its receive level.
+        residual_m: corrected range minus the distance of the anchor from the estimated position.
+        interval_s: time since the previous range of the pair; unknown if the viewer has dropped ranges.
+        received_s: time of reception on the scene's clock.
+    """
+
+    stamp_s: Values
+    raw_m: Values
+    corrected_m: Values
+    sigma_m: Values
+    status: Values
+    true_m: Values = math.nan
+    gap_db: Values = math.nan
+    rx_dbm: Values = math.nan
+    sequence: Values = 0
+    residual_m: Values = math.nan
+    interval_s: Values = math.nan
+    received_s: Values = math.nan
 
 
 def plausible_cir(cir: Cir) -> Cir | None:
@@ -156,55 +191,38 @@ def plausible_cir(cir: Cir) -> Cir | None:
     return replace(cir, samples=cir.samples.copy())
 
 
-class History(Rows):
+class History(Rows[Sample]):
     """Ranges of one pair: of the last minute, or of a recording.
 
     Args:
-        rows: see `RangeColumns`; None: without ranges.
-        outages: see `new_outages`; None: none.
+        rows: see `Sample`; None: without ranges.
+        outages: those of its tag; None: none.
 
     Attributes:
         cir: the last CIR of a stream.
     """
 
-    def __init__(self, rows: NDArray[np.float64] | None = None, outages: Rows | None = None) -> None:
-        super().__init__(np.empty((0, len(RangeColumns._fields))) if rows is None else rows)
-        self._outages = new_outages() if outages is None else outages
+    kind = Sample
+
+    def __init__(self, rows: NDArray[np.float64] | None = None, outages: Outages | None = None) -> None:
+        super().__init__(rows)
+        self._outages = outages or Outages()
         self.cir: Cir | None = None
 
     @property
     def is_interrupted(self) -> bool:
         """Whether the viewer itself has dropped ranges since the last one: the time until the next one is no interval."""
-        outages = self._outages.rows
-        return len(outages) > 0 and bool(outages[-1, 1] > self.latest_stamp_s)
+        return bool(self._outages.last.end_s > self.last.stamp_s)
 
     def outage_s(self, age_s: float) -> float:
         """Return for how long the viewer has dropped ranges since the last one, `age_s` ago."""
-        begin_s, end_s = np.clip(self._outages.rows.T - self.latest_stamp_s, 0.0, age_s)
+        begin_s, end_s = np.clip(self._outages.rows.T - self.last.stamp_s, 0.0, age_s)
         return float((end_s - begin_s).sum())
 
-    @property
-    def columns(self) -> RangeColumns:
-        """The ranges; a change of a value is kept."""
-        return RangeColumns(*self.rows.T)
-
-    @property
-    def latest(self) -> Sample | None:
-        """The last range."""
-        if self._end == self._begin:
-            return None
-        sample = Sample(*self.last[STAMP:])
-        return sample._replace(status=Status(int(sample.status)))
-
-    @property
-    def latest_stamp_s(self) -> float:
-        """Stamp of the last range; NaN: there is none."""
-        return float(self.last[STAMP])
-
-    def add(self, sample: Sample, received_s: float, residual_m: float, limit: int | None) -> None:
-        """Add a range; see `RangeColumns` and `append`."""
-        interval_s = math.nan if self.is_interrupted else sample.stamp_s - self.latest_stamp_s
-        self.append((received_s, residual_m, interval_s, *sample), limit)
+    def add(self, sample: Sample, limit: int | None = None) -> None:
+        """Add a range without its interval; see `append`."""
+        interval_s = math.nan if self.is_interrupted else sample.stamp_s - self.last.stamp_s
+        self.append(sample._replace(interval_s=interval_s), limit)
 
     def remove_before(self, stamp_s: float) -> None:
         """Remove ranges with earlier stamps from the beginning."""
@@ -213,7 +231,7 @@ class History(Rows):
 
     def statistics(self) -> dict[str, float]:
         """Return means and shares (%) of the latest ranges; NaN: unknown."""
-        columns = RangeColumns(*(column[-STATISTICS:] for column in self.columns))
+        columns = Sample(*self.rows[-STATISTICS:].T)
         residual_m, gap_db = _plausible_values(columns.residual_m), _plausible_values(columns.gap_db)
         return {
             "lost": self._lost_percent(),
@@ -280,11 +298,6 @@ class History(Rows):
         )
         interval_s, nlos = latest.mean().to_numpy().T
         return np.column_stack([columns.received_s, residual_m, 1.0 / interval_s, 100.0 * nlos])
-
-
-def new_outages() -> Rows:
-    """Return the intervals, by stamps of a tag, in which the viewer has dropped ranges: begin and end, s."""
-    return Rows(np.empty((0, 2)))
 
 
 def _plausible_values(values: Column) -> Column:

@@ -7,11 +7,10 @@ from bisect import insort
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.positioning.health import NO_DATA_INTERVALS, NO_DATA_S
-from uwb_mitigation.viewer.histories import BoundedDict, Pair
+from uwb_mitigation.viewer.histories import BoundedDict, Pair, Pose
 
 MAX_EVENTS, MAX_SOURCES = 500, 1000
 CHECK_S = 0.5
@@ -80,10 +79,10 @@ class Incidents:
         if moved_m > JUMP_M + MAX_SPEED * passed_s:
             self.add(time_s, f"position of {label}: jump by {moved_m:.1f} m")
 
-    def add_track(self, label: str, rows: NDArray[np.float64], end_s: float) -> None:
-        """Add all positions of a tag until the end of a recording: time, x and y, float64 (n, 3)."""
+    def add_track(self, label: str, poses: Pose, end_s: float) -> None:
+        """Add all positions of a tag until the end of a recording."""
         self._check_s = -math.inf
-        for time_s, x, y in rows.tolist():
+        for time_s, x, y in zip(*np.stack([poses.received_s, poses.x, poses.y]).tolist(), strict=True):
             self.add_position(label, time_s, x, y)
         self.check(end_s)
 

@@ -14,7 +14,8 @@ from bokeh.events import Reset
 
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.types.measurement import FAULTS
-from uwb_mitigation.viewer.figures import HEADINGS, Figures
+from uwb_mitigation.viewer.charts import HEADINGS
+from uwb_mitigation.viewer.figures import Figures
 from uwb_mitigation.viewer.histories import Pair
 from uwb_mitigation.viewer.palette import STATUS_LOOKS, TAG_COLOURS
 from uwb_mitigation.viewer.scene import Scene
@@ -52,7 +53,7 @@ class Page:
         self._state = state = PageState(view)
         self._controls, self._texts, self._figures = state.controls, Texts(state), Figures(state)
         # Register before the model is added to the document: later registrations have no effect.
-        self._figures.map.plot.on_event(Reset, self._on_reset)
+        self._figures.plots["map"].on_event(Reset, self._on_reset)
         # Add all roots in one step: Bokeh searches for new models after each, half of the time to open a page.
         with document.models.freeze():
             for model in (*self._figures.plots.values(), self._texts.pairs, self._controls):
@@ -143,12 +144,12 @@ class Page:
         self._figures.position.location = position_s
         timeline, seconds = self._view.timeline, max(player.seconds, 1e-9)
         if timeline.is_read and self._state.changed("marks", timeline.is_complete):
-            recorded = timeline.scene.incidents
-            ranges = [history.columns for history in timeline.scene.pairs.values()]
+            recorded = timeline.incidents
+            ranges = [history.columns for history in timeline.pairs.values()]
             bad_s = [columns.received_s[np.isin(columns.status, FAULTS)] for columns in ranges]
             bad = np.unique((np.concatenate([np.zeros(0), *bad_s]) / seconds).round(3)).tolist()
             shares = [time_s / seconds for time_s, _ in recorded.all()]
-            counts = {"faults": timeline.scene.faults, "events": recorded.count + len(recorded.largest_error)}
+            counts = {"faults": timeline.faults, "events": recorded.count + len(recorded.largest_error)}
             self._state.set(marks={"bad": bad, "incidents": shares} | counts)
 
     # Events ---------------------------------------------------------------------------------------------------
@@ -158,7 +159,7 @@ class Page:
         try:
             name, arguments = str(command[0]), list(command[1])
             if name == "accuracy":
-                self._figures.map.shows_accuracy = bool(arguments[0])
+                self._figures.shows_accuracy = bool(arguments[0])
             elif name == "select":
                 self.select((int(str(arguments[0]), 0), int(str(arguments[1]), 0)))
             elif self._player is not None:
@@ -181,7 +182,7 @@ class Page:
 
     def _on_reset(self, _event: Reset) -> None:
         with self._view.scene.lock:
-            self._figures.map.fit(self._view.scene)
+            self._figures.fit_map(self._view.scene)
 
     def _on_closed(self, _context: Any) -> None:
         self._view.pages -= 1

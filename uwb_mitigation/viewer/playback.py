@@ -105,7 +105,7 @@ class BagPlayer:
         Args:
             config: its anchors are shown; see `Recording.estimate`, also for the other arguments.
             stamp_offset_s: see there.
-            check: returns `Timeline.displaced` for estimated tracks.
+            check: returns `Scene.displaced` for estimated tracks.
             estimated: see there.
 
         Raises:
@@ -124,7 +124,7 @@ class BagPlayer:
                 timeline.is_complete = True
                 self._show()
                 if check is not None and config is not None and timeline.estimates:
-                    if timeline.scene.ranges <= MAX_CHECKED:
+                    if timeline.ranges <= MAX_CHECKED:
                         timeline.displaced = check(list(timeline.estimates.values()), config)
                     else:
                         limit = f"up to {MAX_CHECKED} ranges: run `track`."
@@ -184,5 +184,5 @@ class BagPlayer:
 
     def _show(self) -> None:
         self._drawn_s = self.shown_s
-        with self.timeline.scene.lock, self.scene.lock:
-            self.scene.show(self.timeline.scene, self._drawn_s)
+        with self.timeline.lock, self.scene.lock:
+            self.scene.show(self.timeline, self._drawn_s)

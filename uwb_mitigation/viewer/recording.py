@@ -33,18 +33,9 @@ from uwb_mitigation.types.ros.poses import tag_frame
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import TruePath
 from uwb_mitigation.viewer.feed import DECODERS, SceneUpdater
-from uwb_mitigation.viewer.histories import MAX_RANGE_M, Pair, RangeColumns, plausible_cir
+from uwb_mitigation.viewer.histories import MAX_RANGE_M, LeverArm, Pair, Pose, Sample, plausible_cir
 from uwb_mitigation.viewer.palette import ATTRIBUTES, TrackKind
-from uwb_mitigation.viewer.scene import (
-    DEFAULT_TAG,
-    MAX_TAGS,
-    POSITION,
-    Scene,
-    Timeline,
-    antenna_position,
-    tag_label,
-    tag_name,
-)
+from uwb_mitigation.viewer.scene import DEFAULT_TAG, MAX_TAGS, Scene, tag_label, tag_name
 
 BATCH = 64
 """Number of messages that are read ahead to correct their ranges in one call."""
@@ -70,7 +61,7 @@ class Event(NamedTuple):
     tag: str
 
 
-class Recording(Timeline):
+class Recording(Scene):
     """A bag with ranges or tracks, and what was read from it; times are log times from the beginning.
 
     Args:
@@ -90,7 +81,7 @@ class Recording(Timeline):
     """
 
     def __init__(self, path: Path, namespace: str | None = None) -> None:
-        super().__init__(Scene(lambda: self.read_s, is_whole=True))
+        super().__init__(lambda: self.read_s, is_whole=True)
         self.path, self._bag, self._table = path, BagReader(path), RangeTable()
         types, bounds = self._bag.topics, self._bag.bounds_ns
         self.prefix = prefix = _namespace(path, types) if namespace is None else namespace.rstrip("/")
@@ -113,7 +104,7 @@ class Recording(Timeline):
         if bounds is None or not self.contents & (RANGES | POSITIONS):
             raise _no_ranges(path, types)
         self.start_ns, self.seconds = bounds[0], (bounds[1] - bounds[0]) / 1e9
-        self.damage, self.read_s = "", 0.0
+        self.damage, self.read_s, self.is_read, self.is_complete = "", 0.0, False, False
 
     @property
     def contents(self) -> set[str]:
@@ -160,7 +151,7 @@ class Recording(Timeline):
         Args:
             backend: corrects raw ranges; None: the recording contains corrected ranges.
         """
-        scene, truths, feed = self.scene, Table(_TRUTH), SceneUpdater(self.scene)
+        truths, feed = Table(_TRUTH), SceneUpdater(self)
         for log_ns, topic, message, tag in self.corrected_events(backend):
             self.read_s = log_ns / NS_PER_S
             if topic == topics.RANGE_RAW:
@@ -173,13 +164,13 @@ class Recording(Timeline):
                 self._table.add_corrected(*message)
             if topic not in (topics.ANCHORS, topics.RANGE_RAW, topics.RANGE_TRUTH):
                 feed.add(topic, message, tag)
-        with scene.lock:
+        with self.lock:
             if self.damage:
                 self.notices.append(f"{self.damage}: nothing beyond can be shown")
             self._add_truths_and_levels(truths.array())
             self.read_s, self.is_read = self.seconds, True
-            scene.incidents.check(self.seconds)
-            _add_largest_error(scene)
+            self.incidents.check(self.seconds)
+            _add_largest_error(self)
 
     def _add_truths_and_levels(self, truths: NDArray[Any]) -> None:
         """Set true ranges (rows of `_TRUTH`) and levels, which may be in any order, and count the errors."""
@@ -190,11 +181,11 @@ class Recording(Timeline):
         )
         order, first = np.lexsort((ranges["tag"], ranges["anchor"])), 0
         # By anchor and tag, as the ranges.
-        for _, history in sorted(self.scene.pairs.items()):
+        for _, history in sorted(self.pairs.items()):
             rows, columns = order[first : first + len(history.rows)], history.columns
             first += len(rows)
             columns.true_m[:], columns.gap_db[:], columns.rx_dbm[:] = true_m[rows], gap_db[rows], rx_dbm[rows]
-        self.scene.count_errors(np.stack([ranges["raw_m"], ranges["range_m"]]) - true_m)
+        self.count_errors(np.stack([ranges["raw_m"], ranges["range_m"]]) - true_m)
 
     def forget_ranges(self) -> None:
         """Free the tables of ranges, which only `estimate` needs."""
@@ -213,14 +204,14 @@ class Recording(Timeline):
         truths: dict[int | None, TruePath] = {}
         with contextlib.suppress(RecordingError):
             truths = read_truth(self.path, self.prefix + topics.ODOMETRY_TRUTH)
-        recorded, scene = self._table.by_tag(config.anchors, stamp_offset_s, truths), self.scene
+        recorded = self._table.by_tag(config.anchors, stamp_offset_s, truths)
         by_tag = {one.recording.tag_id: one for one in estimated}
-        names = {name for name, kind in scene.tracks if kind is TrackKind.CORRECTED}
+        names = {name for name, kind in self.tracks if kind is TrackKind.CORRECTED}
         for tag in recorded.tags[:MAX_TAGS]:
-            of_tag = [history.rows for pair, history in scene.pairs.items() if pair[1] == tag.tag_id]
+            of_tag = [history.rows for pair, history in self.pairs.items() if pair[1] == tag.tag_id]
             if not of_tag:
                 continue
-            name = tag_name(tag.tag_id, names, scene.pairs) or tag_frame(tag.tag_id)
+            name = tag_name(tag.tag_id, names, self.pairs) or tag_frame(tag.tag_id)
             if self.contents & POSITIONS:
                 tracks = {TrackKind.RAW: live_track(config, tag.raw)}
             else:
@@ -236,22 +227,23 @@ class Recording(Timeline):
                 self.notices += [
                     f"{label}{' determination' * (text == state)}: {text}" for text in estimate.warnings
                 ]
-            ranges = RangeColumns(*np.concatenate(of_tag).T)
+            ranges = Sample(*np.concatenate(of_tag).T)
             order = np.argsort(ranges.stamp_s, kind="stable")
             for kind, track in tracks.items():
-                rows = np.full((len(track), POSITION), np.nan)
-                rows[:, 5] = track.stamp_ns / NS_PER_S - stamp_offset_s
-                rows[:, 0] = np.interp(rows[:, 5], ranges.stamp_s[order], ranges.received_s[order])
-                rows[:, 1:4] = track.position
-                rows[:, 4] = np.sqrt(track.covariance[:, 0, 0] + track.covariance[:, 1, 1])
+                stamp_s = track.stamp_ns / NS_PER_S - stamp_offset_s
+                received_s = np.interp(stamp_s, ranges.stamp_s[order], ranges.received_s[order])
+                sd_m = np.sqrt(track.covariance[:, 0, 0] + track.covariance[:, 1, 1])
+                x, y, z = track.position.T
+                poses = Pose(x, y, z, stamp_s=stamp_s, sd_m=sd_m, received_s=received_s)
                 if kind is TrackKind.CORRECTED:
-                    rows[:, 6:9] = [horizontal_ellipse(covariance) for covariance in track.covariance]
-                    scene.incidents.add_track(tag_label(name, None), rows[:, :3], self.seconds)
-                with scene.lock:
-                    scene.set_track(name, kind, rows)
+                    ellipses = np.array([horizontal_ellipse(covariance) for covariance in track.covariance])
+                    poses = poses._replace(**dict(zip(Pose._fields[3:6], ellipses.T, strict=True)))
+                    self.incidents.add_track(tag_label(name, None), poses, self.seconds)
+                with self.lock:
+                    self.set_track(name, kind, np.stack(np.broadcast_arrays(*poses), axis=1))
         # Tracks are those of the antenna, poses those of the robot.
         is_of_robot = topics.POSE in self.contents
-        add_residuals(scene, config.anchors, scene.lever_arms if is_of_robot else {})
+        add_residuals(self, config.anchors, self.lever_arms if is_of_robot else {})
 
 
 def _decode(topic: str, data: bytes) -> Any:
@@ -282,24 +274,21 @@ def _no_ranges(path: Path, types: dict[str, str]) -> RecordingError:
     )
 
 
-def add_residuals(
-    scene: Scene, anchors: AnchorMap, lever_arms: Mapping[str, tuple[float, float, float]] = {}
-) -> None:
+def add_residuals(scene: Scene, anchors: AnchorMap, lever_arms: Mapping[str, LeverArm] = {}) -> None:
     """Set the residuals of ranges: NaN without a recent position, or if the anchor is not in the map; see `Scene.lever_arms`."""
     place = {anchor.id: anchor.position for anchor in anchors.anchors}
-    tracks = {name: track.rows for (name, kind), track in scene.tracks.items() if kind is TrackKind.CORRECTED}
+    tracks = {name: track for (name, kind), track in scene.tracks.items() if kind is TrackKind.CORRECTED}
     for (anchor_id, tag_id), history in scene.pairs.items():
         track, columns = tracks.get(tag_name(tag_id, tracks, scene.pairs)), history.columns
         if track is None or anchor_id not in place:
             continue
-        track = track[np.argsort(track[:, 5], kind="stable")]
-        arm, position, at_s = lever_arms.get(format_id(tag_id)), track[:, 1:4], track[:, 5]
-        if arm is not None:
-            position = antenna_position(position, track[:, -1], arm)
-        x, y, z = (np.interp(columns.stamp_s, at_s, axis) for axis in position.T)
+        poses = Pose(*track.rows[np.argsort(track.columns.stamp_s, kind="stable")].T)
+        if (arm := lever_arms.get(format_id(tag_id))) is not None:
+            poses = poses.antenna(arm)
+        x, y, z = (np.interp(columns.stamp_s, poses.stamp_s, axis) for axis in poses[:3])
         distance_m = np.linalg.norm(np.column_stack([x, y, np.nan_to_num(z)]) - place[anchor_id], axis=1)
-        latest = np.maximum(np.searchsorted(at_s, columns.stamp_s, side="right") - 1, 0)
-        is_recent = np.abs(columns.stamp_s - at_s[latest]) < NO_DATA_S
+        latest = np.maximum(np.searchsorted(poses.stamp_s, columns.stamp_s, side="right") - 1, 0)
+        is_recent = np.abs(columns.stamp_s - poses.stamp_s[latest]) < NO_DATA_S
         columns.residual_m[:] = np.where(is_recent, columns.corrected_m - distance_m, np.nan)
 
 

@@ -17,7 +17,8 @@ from uwb_mitigation.files import write_atomically
 from uwb_mitigation.mitigation.correction import Corrector
 from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.recorded_tracks import TagTracks
-from uwb_mitigation.viewer.figures import HEADINGS, Figures, finish, new_figure
+from uwb_mitigation.viewer.charts import HEADINGS, finish, new_figure
+from uwb_mitigation.viewer.figures import Figures
 from uwb_mitigation.viewer.page import TEMPLATES
 from uwb_mitigation.viewer.palette import TRACK_STYLES, TrackKind
 from uwb_mitigation.viewer.playback import BagPlayer
@@ -99,7 +100,7 @@ def write_report(
         config: of the estimators.
         backend: see `BagPlayer`.
         tracks: the tracks of its tags.
-        displaced: see `Timeline`.
+        displaced: see `Scene`.
         stamp_offset_s: see `BagPlayer.index`.
 
     Raises:

@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 import time
 from bisect import bisect_right
-from collections.abc import Callable, Container, Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import islice
 from threading import Lock
 
@@ -24,7 +24,7 @@ from uwb_mitigation.positioning.online.measurements import TagHeight, TagRange
 from uwb_mitigation.positioning.online.tag_estimator import TagEstimator
 from uwb_mitigation.positioning.recorded_tracks import TagTracks
 from uwb_mitigation.types.anchors import MAX_ANCHORS, Anchor, AnchorMap
-from uwb_mitigation.types.measurement import Cir
+from uwb_mitigation.types.measurement import Cir, Status
 from uwb_mitigation.types.ros.poses import tag_frame
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.viewer.histories import (
@@ -33,10 +33,12 @@ from uwb_mitigation.viewer.histories import (
     MAX_SAMPLES,
     BoundedDict,
     History,
+    LeverArm,
+    Outages,
     Pair,
-    Rows,
+    Pose,
     Sample,
-    new_outages,
+    Trail,
 )
 from uwb_mitigation.viewer.incidents import Incidents
 from uwb_mitigation.viewer.palette import TrackKind
@@ -66,34 +68,6 @@ DEFAULT_TAG = "tag"
 """Name of the tag whose topics have the plain names; the others are named as `tag_frame` does."""
 
 
-@dataclass(slots=True)
-class Pose:
-    """Estimated position of a tag, m.
-
-    Attributes:
-        ellipse: horizontal 95 % ellipse: half axes (m) and angle of the major axis (rad); NaN: unknown.
-        heading_rad: NaN: unknown.
-        stamp_s, sd_m: time of the estimate, s, and horizontal standard deviation; NaN: unknown.
-        received_s: time of reception on the scene's clock; `Scene.add_pose` sets it.
-        speed: m/s, from the pose before.
-    """
-
-    x: float
-    y: float
-    z: float = math.nan
-    ellipse: tuple[float, float, float] = (math.nan, math.nan, math.nan)
-    heading_rad: float = math.nan
-    stamp_s: float = math.nan
-    sd_m: float = math.nan
-    received_s: float = math.nan
-    speed: float = 0.0
-
-
-POSITION = 10
-"""Number of columns of a track: time of reception on the scene's clock (s), x, y, z, horizontal standard deviation (m),
-stamp (s), and of a pose ellipse and heading; NaN: unknown."""
-
-
 @dataclass(frozen=True, slots=True)
 class NodeStatus:
     """The latest diagnostics of one node: level 0 OK, 1 WARN, 2 ERROR, 3 STALE.
@@ -117,6 +91,10 @@ class NodeStatus:
         return replace(self, level=STALE, message=message, determinations=())
 
 
+Displaced = dict[int, tuple[float, Anchor]]
+"""{anchor whose ranges fit another position: (its median held-out residual, m, the anchor there)}."""
+
+
 class Scene:
     """All data that the page shows.
 
@@ -132,12 +110,17 @@ class Scene:
         dropped: number of ranges that the viewer could not read in time.
         pairs: {(anchor, tag): history of its last minute}, the latest at the end.
         tags, anchors, node_statuses: {id or name: ...}.
-        tracks: {(name, kind): positions, with the columns of `POSITION`}.
+        tracks: {(name, kind): positions}.
         lever_arms: {tag id as text: position of its antenna in the frame of its poses, m}; only those that are not 0.
         reports: (time of reception, name, diagnostics) of a recording.
         latest_stamps: {tag: (its latest stamp, time of its reception)}.
         revision: increases with every change, so that a page draws only changes.
         missing: why there are no ranges, anchors or positions.
+        is_read, is_complete: whether a recording has been read, and tracks, residuals and all incidents have been added.
+        cirs_ns: {pair: log time of each raw range with a CIR}, of a recording.
+        notices: messages for the page.
+        estimates: {tag: its estimated tracks}, if a recording contains no positions.
+        displaced: the anchor whose ranges fit another position.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic, is_whole: bool = False) -> None:
@@ -145,6 +128,11 @@ class Scene:
         self.anchors: dict[int, Anchor] = {}
         self.missing = {"ranges": "No ranges received.", "anchors": "No anchor positions."}
         self.received_s, self.revision = math.nan, 0
+        self.is_read = self.is_complete = True
+        self.cirs_ns: dict[Pair, list[int]] = {}
+        self.notices: list[str] = []
+        self.estimates: dict[str, TagTracks] = {}
+        self.displaced: Displaced = {}
         self.clear()
 
     def clear(self) -> None:
@@ -152,14 +140,14 @@ class Scene:
         self.incidents = Incidents()
         # Stamps of different tags may come from different clocks.
         self.latest_stamps: BoundedDict[int | None, tuple[float, float]] = BoundedDict(MAX_PAIRS)
-        self._outages: BoundedDict[int | None, Rows] = BoundedDict(MAX_PAIRS)
+        self._outages: BoundedDict[int | None, Outages] = BoundedDict(MAX_PAIRS)
         self.ranges = self.corrected = self.faults = self.dropped = 0
         self.pairs: BoundedDict[Pair, History] = BoundedDict(math.inf if self.is_whole else MAX_PAIRS)
         self.tags: BoundedDict[str, Pose] = BoundedDict(MAX_TAGS)
-        self.lever_arms: BoundedDict[str, tuple[float, float, float]] = BoundedDict(MAX_TAGS)
+        self.lever_arms: BoundedDict[str, LeverArm] = BoundedDict(MAX_TAGS)
         # {tag: (filter of its raw ranges, stamp of the last pose whose height it got)}
         self._raw_locators: BoundedDict[int, tuple[TagEstimator, float]] = BoundedDict(MAX_TAGS)
-        self.tracks: BoundedDict[tuple[str, TrackKind], Rows] = BoundedDict(4 * MAX_TAGS)
+        self.tracks: BoundedDict[tuple[str, TrackKind], Trail] = BoundedDict(4 * MAX_TAGS)
         self.reports: list[tuple[float, str, NodeStatus]] = []
         self.node_statuses: BoundedDict[str, NodeStatus] = BoundedDict(MAX_NODES)
         self.error_counts = np.zeros((2, len(ERROR_EDGES_M) - 1), np.int64)
@@ -185,15 +173,15 @@ class Scene:
 
         It does not depend on how fast the viewer reads them.
         """
-        return max(0.0, self.latest_stamp_s(pair[1]) - self.pairs[pair].latest_stamp_s)
+        return max(0.0, self.latest_stamp_s(pair[1]) - float(self.pairs[pair].last.stamp_s))
 
-    def age_s(self, entry: Rows | Pose) -> float:
+    def age_s(self, last: Sample | Pose) -> float:
         """Return the time since the last data of a pair, tag or track."""
-        return max(self.clock() - entry.received_s, 0.0)
+        return max(self.clock() - float(last.received_s), 0.0)
 
     def no_data(self, history: History) -> str:
         """Return "no data for 12 s" for a pair that has stopped, else an empty string."""
-        age_s = self.age_s(history)
+        age_s = self.age_s(history.last)
         dropping_s = min(history.outage_s(age_s), MAX_DROPPING_S)
         return "" if age_s - dropping_s <= history.max_gap_s else f"no data for {age_s:.0f} s"
 
@@ -202,8 +190,8 @@ class Scene:
         self.revision += 1
         return self.pairs.touch(pair, lambda: History(outages=self._outages_of(pair[1])))
 
-    def _outages_of(self, tag_id: int | None) -> Rows:
-        return self._outages.touch(tag_id, new_outages)
+    def _outages_of(self, tag_id: int | None) -> Outages:
+        return self._outages.touch(tag_id, Outages)
 
     def add_sample(self, pair: Pair, sample: Sample) -> None:
         """Add a corrected range.
@@ -212,7 +200,7 @@ class Scene:
         """
         tag_id, stamp_s = pair[1], sample.stamp_s
         tag_latest_s, history = self.latest_stamp_s(tag_id), self.history(pair)
-        if stamp_s < tag_latest_s - HISTORY_S or stamp_s < history.latest_stamp_s - 1.0:
+        if stamp_s < tag_latest_s - HISTORY_S or stamp_s < history.last.stamp_s - 1.0:
             tag_latest_s = math.nan
             if not self.is_whole:
                 self.clear_history(tag_id)
@@ -225,14 +213,14 @@ class Scene:
         self.faults += sample.status.is_fault
         self.incidents.add_range(pair, self.clock(), stamp_s)
         self.received_s = self.clock()
-        history = self.pairs[pair]
+        history, sample = self.pairs[pair], sample._replace(received_s=self.received_s)
         if self.is_whole:
-            history.add(sample, self.received_s, math.nan, None)
+            history.add(sample)
         else:
-            history.add(sample, self.received_s, self._compare_with_position(pair, sample), MAX_SAMPLES)
+            history.add(sample._replace(residual_m=self._compare_with_position(pair, sample)), MAX_SAMPLES)
             history.remove_before(tag_latest_s - HISTORY_S)
         if not math.isnan(sample.true_m):
-            self.count_errors(np.array([[sample.raw_m], [sample.range_m]]) - sample.true_m)
+            self.count_errors(np.array([[sample.raw_m], [sample.corrected_m]]) - sample.true_m)
 
     def count_errors(self, errors_m: NDArray[np.float64]) -> None:
         """Count raw and corrected errors, float64 (2, n), in the histograms; NaN: the truth is unknown."""
@@ -260,32 +248,30 @@ class Scene:
     def add_pose(self, tag: str, pose: Pose, kind: TrackKind = TrackKind.CORRECTED) -> None:
         """Append a pose to a track; a corrected one is the latest pose of its tag."""
         self.revision += 1
-        x, y, z, stamp_s, name = pose.x, pose.y, pose.z, pose.stamp_s, tag[:MAX_TEXT]
-        if not _is_plausible(x, y, z):
+        name = tag[:MAX_TEXT]
+        if not _is_plausible(pose.x, pose.y, pose.z):
             return
-        pose.received_s = self.clock()
+        pose = pose._replace(received_s=self.clock())
         if kind is TrackKind.CORRECTED:
             before = self.tags.get(name, pose)
-            passed_s, moved_m = stamp_s - before.stamp_s, math.dist((x, y), (before.x, before.y))
-            pose.speed = moved_m / passed_s if passed_s > 0.0 else before.speed
+            passed_s, moved_m = pose.stamp_s - before.stamp_s, math.dist(pose[:2], before[:2])
+            pose = pose._replace(speed=moved_m / passed_s if passed_s > 0.0 else before.speed)
             self.tags.add(name, pose)
-            self.incidents.add_position(tag_label(name, None), pose.received_s, x, y)
-        if not math.isfinite(stamp_s):
+            self.incidents.add_position(tag_label(name, None), pose.received_s, pose.x, pose.y)
+        if not math.isfinite(pose.stamp_s):
             return
-        track = self.tracks.touch((name, kind), lambda: Rows(np.empty((0, POSITION))))
-        row = pose.received_s, x, y, z, pose.sd_m, stamp_s, *pose.ellipse, pose.heading_rad
+        track = self.tracks.touch((name, kind), Trail)
+        step_s, step_m = pose.stamp_s - track.last.stamp_s, math.dist(track.last[:2], pose[:2])
         if self.is_whole:
-            track.append(row)
-            return
-        step_s, step_m = stamp_s - track.last[5], math.dist(track.last[1:3], (x, y))
-        if step_s < -1.0:
-            self.set_track(name, kind, np.array([row]))
+            track.append(pose)
+        elif step_s < -1.0:
+            self.set_track(name, kind, [pose])
         elif not (step_s < STEP_S or (step_m < STEP_M and step_s < 5 * STEP_S)):
-            track.append(row, MAX_TRACK)
+            track.append(pose, MAX_TRACK)
 
-    def set_track(self, tag: str, kind: TrackKind, rows: NDArray[np.float64]) -> None:
-        """Replace a track, float64 (k, `POSITION`)."""
-        self.tracks.add((tag[:MAX_TEXT], kind), Rows(rows))
+    def set_track(self, tag: str, kind: TrackKind, poses: NDArray[np.float64] | Sequence[Pose]) -> None:
+        """Replace a track by poses or their rows, float64 (k, 11)."""
+        self.tracks.add((tag[:MAX_TEXT], kind), Trail(np.reshape(poses, (-1, len(Pose._fields)))))
         self.revision += 1
 
     def show(self, recorded: Scene, now_s: float) -> None:
@@ -298,17 +284,16 @@ class Scene:
             (pair, history.until(now_s, now_s - HISTORY_S)) for pair, history in recorded.pairs.items()
         ]
         begun = [(pair, history) for pair, history in histories if len(history.rows)]
-        for pair, history in sorted(begun, key=lambda item: item[1].received_s):
+        for pair, history in sorted(begun, key=lambda item: item[1].last.received_s):
             self.pairs.add(pair, history)
-            self.latest_stamps.add(pair[1], (float(history.columns.stamp_s[-1]), history.received_s))
-            self.received_s = history.received_s
+            self.received_s = history.last.received_s
+            self.latest_stamps.add(pair[1], (history.last.stamp_s, self.received_s))
         for (name, kind), track in recorded.tracks.items():
-            rows = track.until(now_s).rows
-            if len(rows):
-                self.set_track(name, kind, rows)
-            if len(rows) and kind is TrackKind.CORRECTED:
-                received_s, x, y, z, sd_m, stamp_s, *ellipse, heading_rad = rows[-1].tolist()
-                self.tags.add(name, Pose(x, y, z, tuple(ellipse), heading_rad, stamp_s, sd_m, received_s))
+            trail = track.until(now_s)
+            if len(trail.rows):
+                self.set_track(name, kind, trail.rows)
+            if len(trail.rows) and kind is TrackKind.CORRECTED:
+                self.tags.add(name, trail.last)
         begin, end = (bisect_right(recorded.reports, (at_s,)) for at_s in (now_s - HISTORY_S, now_s + 1e-6))
         for _, name, report in recorded.reports[begin:end]:
             self.set_node_status(name, report)
@@ -319,14 +304,13 @@ class Scene:
         if pose is None or anchor is None or self.age_s(pose) > NO_DATA_S:
             return math.nan
         if (arm := self.lever_arms.get(format_id(pair[1]))) is not None:
-            x, y, z = antenna_position(np.array([pose.x, pose.y, pose.z]), pose.heading_rad, arm).tolist()
-            pose = replace(pose, x=x, y=y, z=z)
+            pose = pose.antenna(arm)
         self._locate_raw(pair, pose, sample)
         # On a busy computer, positions arrive late.
         if abs(pose.stamp_s - sample.stamp_s) * pose.speed > MAX_MOVED_M:
             return math.nan
         x, y, z = anchor.position
-        return sample.range_m - math.hypot(pose.x - x, pose.y - y, finite_or_zero(pose.z - z))
+        return float(sample.corrected_m) - math.hypot(pose.x - x, pose.y - y, finite_or_zero(pose.z - z))
 
     def _locate_raw(self, pair: Pair, pose: Pose, sample: Sample) -> None:
         """Filter the raw ranges of a tag as the locator filters the corrected ones, at the height of the locator."""
@@ -341,8 +325,9 @@ class Scene:
         row = self._anchor_map.index[pair[0]]
         estimate = estimator.add(TagRange(round(sample.stamp_s * NS_PER_S), row, sample.raw_m))
         if estimate is not None:
-            name, (x, y, z) = tag_frame(pair[1]), estimate.position.tolist()
+            name = tag_frame(pair[1])
             name = name if name in self.tags else DEFAULT_TAG
+            x, y, z = estimate.position.tolist()
             self.add_pose(name, Pose(x, y, z, stamp_s=sample.stamp_s), TrackKind.RAW)
 
     def set_anchors(self, anchors: Iterable[Anchor]) -> None:
@@ -383,56 +368,12 @@ class Scene:
     def latest(self) -> Iterator[tuple[Pair, History, Sample]]:
         """Yield every pair with its last range, by anchor and tag; also pairs that have stopped."""
         for pair, history in sorted(self.pairs.items()):
-            if history.latest is not None:
-                yield pair, history, history.latest
+            if len(history.rows):
+                yield pair, history, history.last._replace(status=Status(int(history.last.status)))
 
     def tag_of(self, tag_id: int) -> Pose | None:
         """Return the position of the tag of a range; None: it has none."""
         return self.tags.get(tag_name(tag_id, self.tags, self.pairs))
-
-
-Displaced = dict[int, tuple[float, Anchor]]
-"""{anchor whose ranges fit another position: (its median held-out residual, m, the anchor there)}."""
-
-
-@dataclass
-class Timeline:
-    """Everything that does not depend on the time that a page shows: of a recording, or of live topics.
-
-    Attributes:
-        scene: its data.
-        is_read: whether it has been read completely.
-        is_complete: whether tracks, residuals and all incidents have been added.
-        cirs_ns: {pair: log time of each raw range with a CIR}.
-        notices: messages for the page.
-        estimates: {tag: its estimated tracks}, if a recording contains no positions.
-        displaced: the anchor whose ranges fit another position.
-    """
-
-    scene: Scene
-    is_read: bool = False
-    is_complete: bool = False
-    cirs_ns: dict[Pair, list[int]] = field(default_factory=dict)
-    notices: list[str] = field(default_factory=list)
-    estimates: dict[str, TagTracks] = field(default_factory=dict)
-    displaced: Displaced = field(default_factory=dict)
-
-
-def antenna_position(
-    position: NDArray[np.float64],
-    heading_rad: NDArray[np.float64] | float,
-    arm: tuple[float, float, float],
-) -> NDArray[np.float64]:
-    """Return positions of an antenna, float64 (..., 3), m, from those of a robot as the locator publishes them.
-
-    Without a heading (NaN), their x and y are those of the antenna.
-    """
-    x, y, z = arm
-    turned = np.nan_to_num(np.exp(1j * np.asarray(heading_rad)) * complex(x, y))
-    result: NDArray[np.float64] = position + np.stack(
-        [turned.real, turned.imag, np.full(turned.shape, z)], axis=-1
-    )
-    return result
 
 
 def plain_tag_id(names: Container[str], pairs: Iterable[Pair]) -> int | None:

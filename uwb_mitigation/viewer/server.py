@@ -203,19 +203,14 @@ def accepted_hosts(host: str, port: int, more: tuple[str, ...]) -> list[str]:
     """
     names = {"localhost", "127.0.0.1"}
     if host in ALL_ADDRESSES:
-        names |= _machine_names()
+        own, families = socket.gethostname().lower(), (socket.AF_INET, socket.AF_INET6)
+        entries = [entry for interface in psutil.net_if_addrs().values() for entry in interface]
+        # A browser omits the zone of an IPv6 address.
+        addresses = {entry.address.partition("%")[0] for entry in entries if entry.family in families}
+        names |= {own, f"{own}.local"} | addresses
     else:
         names.add(host.lower())
     return [*(f"{_bracketed(name)}:{port}" for name in sorted(names)), *(origin.lower() for origin in more)]
-
-
-def _machine_names() -> set[str]:
-    """Return the name and the addresses of this machine; a browser omits the zone of an IPv6 address."""
-    name = socket.gethostname().lower()
-    entries = [entry for interface in psutil.net_if_addrs().values() for entry in interface]
-    families = socket.AF_INET, socket.AF_INET6
-    addresses = {entry.address.partition("%")[0] for entry in entries if entry.family in families}
-    return {name, f"{name}.local"} | addresses
 
 
 def _bracketed(name: str) -> str:

@@ -12,7 +12,7 @@ from bokeh.models import ColumnDataSource
 
 from uwb_mitigation.types.measurement import Cir
 from uwb_mitigation.viewer.histories import HISTORY_S, History, Pair
-from uwb_mitigation.viewer.scene import Scene, Timeline
+from uwb_mitigation.viewer.scene import Scene
 
 if TYPE_CHECKING:
     from uwb_mitigation.viewer.playback import BagPlayer
@@ -26,7 +26,7 @@ class View:
         scene: what they show.
         window: number of samples that the network reads.
         player: player of a recording; None: live.
-        timeline: the content of the recording, or of the live topics.
+        timeline: all data: of the recording as far as it has been read, or of the live topics.
         pages: number of open pages.
     """
 
@@ -37,13 +37,12 @@ class View:
     pages: int = 0
 
     def __post_init__(self) -> None:
-        live = Timeline(self.scene, is_read=True, is_complete=True)
-        self.timeline: Timeline = live if self.player is None else self.player.timeline
+        self.timeline: Scene = self.scene if self.player is None else self.player.timeline
 
     @property
     def all_data(self) -> Scene:
         """All data: of the recording as soon as it has been read, else those of the scene."""
-        return self.timeline.scene if self.timeline.is_read else self.scene
+        return self.timeline if self.timeline.is_read else self.scene
 
 
 class Controls(DataModel):  # type: ignore[misc]

@@ -107,7 +107,7 @@ class Texts:
         displaced = self._view.timeline.displaced
         rows, pairs = list[tuple[Any, ...]](), dict[Pair, Means]()
         for pair, history, sample in scene.latest():
-            missing, age_s = scene.no_data(history), scene.age_s(history)
+            missing, age_s = scene.no_data(history), scene.age_s(sample)
             means = dict.fromkeys(history.statistics(), math.nan) if missing else history.statistics()
             means |= {
                 "rate": 0.0 if missing else history.rate_hz(scene.stamp_age_s(pair)),
@@ -124,7 +124,7 @@ class Texts:
                 means |= {"residual": math.nan, "evidence": 0.0}
             pairs[pair] = means
             status, ids = missing or sample.status.name, map(format_id, pair)
-            measured = sample.raw_m, sample.range_m, sample.sigma_m
+            measured = sample.raw_m, sample.corrected_m, sample.sigma_m
             shown = (means[name] for name in list(COLUMNS)[5:])
             rows.append((*ids, bool(missing), self._health(pair, means), status, *measured, *shown))
         self._page.has_data = any(means["stopped"] == 0.0 for means in pairs.values())

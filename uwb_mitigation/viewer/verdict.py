@@ -11,47 +11,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import format_id
+from uwb_mitigation.positioning import health
 from uwb_mitigation.positioning.geometry import dop
-from uwb_mitigation.positioning.health import (
-    BAD,
-    CHECK,
-    DEGRADED,
-    EVIDENCE,
-    GOOD,
-    LONG_M,
-    LOST,
-    MAX_LOST,
-    MAX_NLOS,
-    MAX_NOT_OK,
-    MIN_ANCHORS,
-    NO_DATA_S,
-    POSITION_GOOD,
-    SILENT,
-    UNDETERMINED,
-    UNKNOWN,
-    VERY_LONG_M,
-    WAITING,
-    Means,
-    Verdict,
-    accuracy_text,
-    degradation,
-)
+from uwb_mitigation.positioning.health import Means, Verdict
 from uwb_mitigation.viewer.histories import Pair
 from uwb_mitigation.viewer.palette import GREEN, ORANGE, PAPER, VERMILLION
 from uwb_mitigation.viewer.scene import Scene
 
 LOOKS = {
-    GOOD: ("hex", GREEN),
-    CHECK: ("square_pin", ORANGE),
-    BAD: ("circle_x", VERMILLION),
-    UNKNOWN: ("hex_dot", PAPER),
-    SILENT: ("hex", PAPER),
+    health.GOOD: ("hex", GREEN),
+    health.CHECK: ("square_pin", ORANGE),
+    health.BAD: ("circle_x", VERMILLION),
+    health.UNKNOWN: ("hex_dot", PAPER),
+    health.SILENT: ("hex", PAPER),
 }
 """Marker and colour of an anchor for each state; statuses of ranges have other markers."""
 STATES = (
-    f"{BAD}: ranges stopped, or a mean residual over {VERY_LONG_M:.2f} m with line of sight. {CHECK}: a mean residual over {LONG_M:.2f} "
-    f"m, {MAX_LOST:.0f} % lost, {MAX_NOT_OK:.0f} % with a status that needs attention, or {MAX_NLOS:.0f} % NLOS. {UNKNOWN}: fewer than "
-    f"{EVIDENCE} ranges can be compared with the position. {SILENT}: none so far, or of no anchor. The status "
+    f"{health.BAD}: ranges stopped, or a mean residual over {health.VERY_LONG_M:.2f} m with line of sight. {health.CHECK}: a mean residual over {health.LONG_M:.2f} "
+    f"m, {health.MAX_LOST:.0f} % lost, {health.MAX_NOT_OK:.0f} % with a status that needs attention, or {health.MAX_NLOS:.0f} % NLOS. {health.UNKNOWN}: fewer than "
+    f"{health.EVIDENCE} ranges can be compared with the position. {health.SILENT}: none so far, or of no anchor. The status "
     "of a pair shows only whether the network could correct the range."
 )
 """Definition of the states, for the page."""
@@ -98,41 +76,48 @@ def verdict(
         remedy: why the position is not unique, with the remedy; empty: it is, or unknown.
     """
     name = "" if tag_id is None else f"tag {format_id(tag_id)}"
-    ages_s = [scene.age_s(history) for (_, pair_tag), history in scene.pairs.items() if pair_tag == tag_id]
+    ages_s = [
+        scene.age_s(history.last) for (_, pair_tag), history in scene.pairs.items() if pair_tag == tag_id
+    ]
     pose = next(iter(scene.tags.values()), None) if tag_id is None else scene.tag_of(tag_id)
     received = [key for key, means in anchors.items() if means["stopped"] == 0.0]
     reason, action = _of_remedy(remedy)
     if tag_id is None and pose is None:
-        return Verdict(WAITING)
-    if ages_s and min(ages_s) > NO_DATA_S:
+        return Verdict(health.WAITING)
+    if ages_s and min(ages_s) > health.NO_DATA_S:
         reason = f"no ranges of {name} for {min(ages_s):.0f} s"
-        return Verdict(LOST, reason, "Check power of the tag, and the driver.")
+        return Verdict(health.LOST, reason, "Check power of the tag, and the driver.")
     jump_at_s, jump_s = scene.incidents.clock_jumps.get(-1 if tag_id is None else tag_id, _NO_JUMP)
     # The last positions before a jump may arrive after it.
-    is_lost = pose is not None and scene.age_s(pose) > NO_DATA_S
-    begin_s = scene.clock() - JUMP_S if pose is None else pose.received_s - NO_DATA_S
+    is_lost = pose is not None and scene.age_s(pose) > health.NO_DATA_S
+    begin_s = scene.clock() - JUMP_S if pose is None else pose.received_s - health.NO_DATA_S
     silent = sorted(set(scene.anchors).difference(received))
     # A paused bag is a jump, too: without a position before it, other reasons are more likely.
-    is_explained = bool(reason or (silent and 0 < len(received) <= MIN_ANCHORS))
+    is_explained = bool(reason or (silent and 0 < len(received) <= health.MIN_ANCHORS))
     if (is_lost or (pose is None and not is_explained)) and jump_at_s > begin_s:
         reason = f"the clock of {name} jumped by {jump_s:+.0f} s"
-        return Verdict(LOST if is_lost else UNDETERMINED, reason, SYNCHRONISE)
+        return Verdict(health.LOST if is_lost else health.UNDETERMINED, reason, SYNCHRONISE)
     if pose is None:
         action = action or "see the notices below"
-        if silent and 0 < len(received) <= MIN_ANCHORS:
+        if silent and 0 < len(received) <= health.MIN_ANCHORS:
             senders, missing = " and ".join(map(format_id, received)), ", ".join(map(format_id, silent[:6]))
             senders = f"anchors {senders} send" if len(received) > 1 else f"anchor {senders} sends"
             reason = f"only {senders} ranges; no ranges from {missing}" + (", ..." if silent[6:] else "")
             action = f"Find out why: check power, PAN id, and ids in the anchors file. Without them: {action}"
-        return Verdict(UNDETERMINED, reason or f"no position of {name}", _sentence(action))
+        return Verdict(health.UNDETERMINED, reason or f"no position of {name}", _sentence(action))
     if is_lost:
         reason = f"no position of {name} for {scene.age_s(pose):.0f} s"
-        return Verdict(LOST, reason, _sentence(remedy or "Drive into the area of the anchors"))
+        return Verdict(health.LOST, reason, _sentence(remedy or "Drive into the area of the anchors"))
     sd_m = pose.sd_m
     names = {anchor_id: place.name for anchor_id, place in scene.anchors.items()}
     if not reason:
-        reason, action = degradation(anchors, states, names, sd_m)
-    return Verdict(DEGRADED if reason else POSITION_GOOD, reason, _sentence(action), accuracy_text(sd_m))
+        reason, action = health.degradation(anchors, states, names, sd_m)
+    return Verdict(
+        health.DEGRADED if reason else health.POSITION_GOOD,
+        reason,
+        _sentence(action),
+        health.accuracy_text(sd_m),
+    )
 
 
 def _of_remedy(remedy: str) -> tuple[str, str]:
@@ -158,12 +143,16 @@ class HeldVerdict:
     """
 
     def __init__(self) -> None:
-        self.shown, self._since_s, self._now_s = Verdict(WAITING), math.nan, -math.inf
+        self.shown, self._since_s, self._now_s = Verdict(health.WAITING), math.nan, -math.inf
 
     def update(self, new: Verdict, now_s: float) -> Verdict:
         """Return the verdict to show at a time; after a jump of the time, it is the new one."""
         continues, self._now_s = 0.0 <= now_s - self._now_s <= HOLD_S, now_s
-        if not (continues and new.state == POSITION_GOOD and self.shown.state in (DEGRADED, LOST)):
+        if not (
+            continues
+            and new.state == health.POSITION_GOOD
+            and self.shown.state in (health.DEGRADED, health.LOST)
+        ):
             self._since_s = math.nan
             self.shown = new
         elif math.isnan(self._since_s):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from datetime import datetime, timezone
 from typing import Any
@@ -13,9 +12,10 @@ from markupsafe import Markup
 from uwb_mitigation.calibration.site import SiteCalibration
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.mitigation.model.bundle import Bundle
+from uwb_mitigation.viewer.histories import Pose
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.report import draw_boxes, draw_scene, render_report
-from uwb_mitigation.viewer.scene import POSITION, Pose, Scene
+from uwb_mitigation.viewer.scene import Scene
 from uwb_mitigation.viewer.state import View
 
 PERCENTILES = (5, 25, 50, 75, 95)
@@ -101,12 +101,10 @@ def _view(calibration: SiteCalibration, errors_m: np.ndarray[Any, Any]) -> View:
     scene.set_anchors(calibration.site.anchors.anchors)
     for segment in np.unique(solution.track_of):
         places = solution.track[(solution.track_of == segment) & np.isfinite(solution.track).all(axis=1)]
-        columns = np.column_stack(
-            [np.zeros(len(places)), places, np.full((len(places), POSITION - 4), math.nan)]
-        )
-        scene.set_track(f"segment {segment}", TrackKind.CORRECTED, columns)
-        if len(places) == 1:
+        poses = [Pose(x, y, z, received_s=0.0) for x, y, z in places.tolist()]
+        scene.set_track(f"segment {segment}", TrackKind.CORRECTED, poses)
+        if len(poses) == 1:
             # A stationary tag.
-            scene.add_pose(f"segment {segment}", Pose(*places[0].tolist()))
+            scene.add_pose(f"segment {segment}", poses[0])
     scene.count_errors(errors_m)
     return View(scene)
