@@ -97,7 +97,6 @@ class Bench:
         return self
 
     def start_again(self) -> Bench:
-        """Open the port once more."""
         self.session.closed(0)
         self.session.opened(self.now_ns)
         return self.start()
@@ -110,7 +109,6 @@ class Bench:
         return self.board._calibration
 
     def port(self) -> UciPort:
-        """Return a port with this session."""
         settings = UciPortSettings(PortAddress("/dev/no"), self.session.settings)
         port = UciPort(settings, (0, None, print, lambda: 0))
         port.session = self.session
