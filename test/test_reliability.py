@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import re
 import signal
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +17,6 @@ from model_material import bundle
 from rclpy.qos import qos_profile_sensor_data
 from ros_harness import PAUSED, Ros, stamped_after
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import Range
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
 from uwb_mitigation.mitigation.model.bundle import load_bundle
@@ -240,25 +237,3 @@ def test_best_effort_publisher_is_reported_and_received_with_a_qos_override(ros:
         return len(corrected) > 0
 
     ros.spin_until(heard)
-
-
-@pytest.mark.ros
-def test_corrected_ranges_are_published_as_sensor_msgs_on_request(ros: Ros):
-    measurement = next(iter(SimulatedSource(seed=2))).measurement
-    corrected = ros.collect(RangeCorrected, CORRECTED)
-    plain = ros.collect(Range, f"{CORRECTED}/anchor_{measurement.anchor_id}")
-    ros.start("mitigator", "sensor_ranges:=true").wait_for_output("correcting with model")
-    publisher = ros.node.create_publisher(RangeCir, RAW, 10)
-    ros.spin_until(lambda: publisher.get_subscription_count() == 1)
-
-    def heard() -> bool:
-        publisher.publish(encode_range(measurement))
-        return len(plain) > 0 and len(corrected) > 0
-
-    ros.spin_until(heard)
-    assert (plain[-1].range, plain[-1].variance) == (corrected[-1].range, corrected[-1].variance)
-    assert plain[-1].header == corrected[-1].header
-    plain.clear()
-    publisher.publish(encode_range(replace(measurement, range_m=math.nan)))
-    ros.spin_until(lambda: bool(plain) and plain[-1].range == math.inf)
-    assert plain[-1].variance == math.inf
