@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
+from drives import HALL
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
@@ -31,6 +32,7 @@ from uwb_mitigation.types.ros.topics import (
     RANGE_TRUTH,
     RANGE_TRUTH_TYPE,
 )
+from uwb_mitigation.types.tracks import Ranges
 
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000
@@ -54,6 +56,13 @@ def record(number: int, samples: int = 20) -> Record:
         START_NS + number * STEP_NS, 7, 1 + number % 2, number, number * 1000, 4.5 + number, cir, "antenna"
     )
     return Record(measurement, Truth(4.0 + number, "NDP NLOS", f"place {number}"))
+
+
+def without_cir(ranges: Ranges, row: int) -> RangeMeasurement:
+    """Return a range of a drive past `HALL`."""
+    stamp_ns, anchor_id = int(ranges.stamp_ns[row]), HALL.anchors[ranges.anchor[row]].id
+    empty = Cir(np.zeros(0, np.int16))
+    return RangeMeasurement(stamp_ns, 7, anchor_id, row, 0, float(ranges.range_m[row]), empty)
 
 
 def corrected(number: int) -> CorrectedRange:

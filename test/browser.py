@@ -95,7 +95,6 @@ class Browser:
         self.driver.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
 
     def run(self, script: str, *arguments: object) -> Any:
-        """Return the result of a script."""
         return self._repeat(lambda: self.driver.execute_script(script, *arguments))
 
     def _repeat(self, call: Callable[[], Any]) -> Any:
@@ -161,7 +160,6 @@ class Browser:
         return {title: (value, explanation) for title, value, explanation in texts}
 
     def text(self) -> str:
-        """Return the visible text of the page."""
         return self.run("return document.body.innerText")
 
     def column(self, model: str, name: str) -> list[Any]:
@@ -175,7 +173,6 @@ class Browser:
         )
 
     def console_messages(self) -> list[str]:
-        """Return the warnings and errors in the console of the page."""
         return [line["message"] for line in self.driver.get_log("browser") if line["level"] != "INFO"]
 
     def cut_off(self, width: int) -> list[str]:

@@ -58,12 +58,10 @@ os.environ |= {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_PYTHON_CHECK_F
 
 
 def diagnostic_values(status: DiagnosticStatus) -> dict[str, str]:
-    """Return the values of a diagnostic status."""
     return {diagnostic_value.key: diagnostic_value.value for diagnostic_value in status.values}
 
 
 def header_at(time_ns: int, frame: str = "") -> Header:
-    """Return a header with a stamp."""
     return Header(stamp=Time(sec=time_ns // NS_PER_S, nanosec=time_ns % NS_PER_S), frame_id=frame)
 
 
@@ -247,7 +245,6 @@ class Ros:
         return response is None or response.success
 
     def set_parameter(self, node: str, name: str, value: object) -> SetParametersResult:
-        """Set a parameter by its service."""
         request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
         return self.call(SetParameters, f"/{node}/set_parameters", request).results[0]
 

@@ -469,7 +469,6 @@ def test_the_real_labyrinth_is_imported_with_its_odometry(tmp_path: Path):
 
 
 def with_text(cir: str, samples: str) -> tuple[str, dict[str, Any]]:
-    """Return a range with the text of a CIR, and its mapping."""
     return f't,a,r,c\n0,1,2,"{cir}"\n', {"cir": {"column": "c", "samples": samples}}
 
 

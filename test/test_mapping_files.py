@@ -60,7 +60,6 @@ def every(step_s: float) -> str:
 
 
 def in_unit(unit: str) -> Any:
-    """Return fields with stamps of another unit."""
     return with_fields(stamp={"column": "t", "unit": unit})
 
 
@@ -68,7 +67,6 @@ AMPLITUDES = {"cir": {"column": "cir", "samples": "magnitude"}}
 
 
 def with_cir(samples: Iterable[float]) -> str:
-    """Return a range with a CIR."""
     return f't,a,r,cir\n0,2,3.0,"{" ".join(map(str, samples))}"\n'
 
 
@@ -432,16 +430,13 @@ def starloc(folder: Path, swapped: bool = False) -> Path:
     return folder / "data/loop-2d_s1"
 
 
-def test_markers_of_starloc_get_the_ids_of_their_radios(tmp_path: Path):
+def test_markers_get_the_ids_of_their_radios_and_wrong_ids_and_swapped_columns_are_reported(tmp_path: Path):
     source = open_mapped(starloc(tmp_path), "starloc")
     assert sorted(source.anchors.index) == sorted(MARKERS.values())
     assert not source.warnings
-
-
-def test_wrong_anchor_ids_and_swapped_columns_are_reported_by_anchor(tmp_path: Path):
     document = load_mapping("starloc").model_dump()
     document["anchors"] = {**document["anchors"][0], "id": "Unnamed: 0"}
-    differs, missing, unused = read(document, starloc(tmp_path)).warnings
+    differs, missing, unused = read(document, tmp_path / "data/loop-2d_s1").warnings
     assert differs.startswith("true ranges and distances from positions differ for anchor 6 by ")
     assert all(f" {radio} by " in differs for radio in (6, 10, 11, 12))
     assert " 9 by " not in differs

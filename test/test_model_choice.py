@@ -145,7 +145,7 @@ def test_process_and_evaluate_use_two_models_for_a_mixed_recording(mixed_bag: Pa
 
 
 def test_track_corrects_a_recording_of_raw_ranges_as_process_does(tmp_path: Path) -> None:
-    succeed("data simulate --like drive --ranges 400 -o raw.mcap", folder=tmp_path)
+    succeed("data simulate --like drive --ranges 200 -o raw.mcap", folder=tmp_path)
     succeed("process raw.mcap --offsets 0.22 -o done.mcap", folder=tmp_path)
     options = "--anchors raw.anchors.yaml --height 0"
     succeed(f"track done.mcap {options} -o a.mcap --json a.json", folder=tmp_path)

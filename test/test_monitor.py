@@ -17,6 +17,13 @@ from uwb_mitigation.types.measurement import CorrectedBy, CorrectedRange, Status
 from uwb_mitigation.types.ros.codec import MeasurementKey
 
 
+def printed(table: object, width: int = 100) -> str:
+    """Return what a terminal of this width shows."""
+    console = Console(width=width, record=True)
+    console.print(table)
+    return console.export_text()
+
+
 def corrected(
     statistics: RangeStatistics, sequence: int, raw: float, out: float, latency_s: float = 0.001
 ) -> None:
@@ -46,20 +53,14 @@ def test_ranges_before_the_other_topic_are_not_lost(late: str):
         if (late != "corrected" or index >= 37) and index != 100:
             corrected(statistics, index, 2.2, 1.9)
     assert statistics.missing == 1
-    console = Console(width=100, record=True)
-    console.print(summary(statistics))
-    assert "37 of the " in console.export_text()
+    assert "37 of the " in printed(summary(statistics))
 
 
 def test_ranges_without_a_mitigator_are_not_called_lost():
     statistics = RangeStatistics()
     statistics.add_raw(0)
-    console = Console(width=100, record=True)
-    console.print(summary(statistics))
-    assert (
-        "1 ranges received, 0 corrected, no /uwb/range_corrected: is the mitigator running?"
-        in console.export_text()
-    )
+    expected = "1 ranges received, 0 corrected, no /uwb/range_corrected: is the mitigator running?"
+    assert expected in printed(summary(statistics))
 
 
 def test_errors_are_absolute_and_grouped_by_label():
@@ -79,13 +80,11 @@ def test_errors_are_absolute_and_grouped_by_label():
 @pytest.mark.parametrize("width", [80, 60])
 def test_table_with_units_fits_the_terminal_and_omits_columns(width: int):
     statistics = RangeStatistics()
-    console = Console(width=width, record=True)
     key = MeasurementKey(0, 101, 1, 0)
     result = CorrectedRange(2.923, 3.4, 0.477, 0.069, Status.OK, CorrectedBy.HOST, 1)
     statistics.add_truth(key, Truth(3.0, "NLOS"))
     statistics.add_corrected(key, result, 0.001)
-    console.print(live_table(statistics, "", console.width))
-    shown = console.export_text()
+    shown = printed(live_table(statistics, "", width), width)
     words = re.findall(r"[a-zA-Z]+", shown)
     assert {"corrected", "sigma", "true", "status", "OK"} <= set(words)
     assert ("label" in words) == (width == 80)
@@ -94,5 +93,4 @@ def test_table_with_units_fits_the_terminal_and_omits_columns(width: int):
         (header,) = re.findall(r"┏[^│]*rate[^│]*┩\n", quote)
         assert header in shown
     statistics.pairs[1, 101].truth = None
-    console.print(live_table(statistics, ""))
-    assert "true" not in console.export_text()
+    assert "true" not in printed(live_table(statistics, ""))

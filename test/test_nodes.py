@@ -21,6 +21,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from rclpy.serialization import deserialize_message
 from ros_harness import PAUSED, Ros
+from sensor_msgs.msg import Range
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 
 from uwb_mitigation.errors import DamagedRecordingError
@@ -149,16 +150,25 @@ def good_message() -> RangeCir:
     return deserialize_message(encode_range(measurement), RangeCir)
 
 
-def test_ranges_that_cannot_be_corrected_pass_through(ros: Ros):
+def test_ranges_that_cannot_be_corrected_pass_through_also_as_sensor_msgs(ros: Ros):
     changes = (
         ({"samples": array("h")}, Status.NO_CIR),
         ({"encoding": 9}, Status.NO_CIR),
         ({"scale": math.inf}, Status.BAD_CIR),
         ({"range": math.nan}, Status.OUT_OF_DISTRIBUTION),
     )
-    mitigator = ros.start("mitigator")
+    mitigator = ros.start("mitigator", "sensor_ranges:=true")
     publisher = ros.node.create_publisher(RangeCir, RAW, 10)
     corrected = ros.collect(RangeCorrected, CORRECTED)
+    plain = ros.collect(Range, f"{CORRECTED}/anchor_{good_message().anchor_id}")
+
+    def heard() -> bool:
+        publisher.publish(good_message())
+        return len(plain) > 0 and len(corrected) > 0
+
+    ros.spin_until(heard)
+    assert (plain[-1].range, plain[-1].variance) == (corrected[-1].range, corrected[-1].variance)
+    assert plain[-1].header == corrected[-1].header
     ros.find_each_other(publisher, good_message(), corrected)
     for change, status in changes:
         message = good_message()
@@ -171,6 +181,8 @@ def test_ranges_that_cannot_be_corrected_pass_through(ros: Ros):
         assert (answer.status, answer.correction) == (status, 0.0)
         assert np.array_equal([answer.range, answer.range_raw], [message.range] * 2, equal_nan=True)
         assert math.isinf(answer.variance) == math.isnan(message.range)
+    ros.spin_until(lambda: plain[-1].range == math.inf)
+    assert plain[-1].variance == math.inf
     mitigator.wait_for_output("ranges with status BAD_CIR: a sample or the scale of the CIR is NaN")
 
 

@@ -45,7 +45,8 @@ def finished(tmp_path_factory) -> tuple[Path, ExperimentResults]:
     folder = tmp_path_factory.mktemp("protocol")
     wanted = experiment.list_tasks(["remnet", "remnet_k5", "remnet_attention", "mlp"], [157], seeds=2)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(training, "RANGE_TEST_RATES", np.geomspace(1e-6, 10.0, 300))
+        patch.setattr(training, "RANGE_TEST_RATES", np.geomspace(1e-6, 10.0, 60))
+        patch.setattr(training, "UNCHANGED", 20)
         return folder, experiment.run_experiment(parts(), folder, wanted, QUICK, trials=3)
 
 

@@ -93,16 +93,6 @@ def test_nodes_refuse_parameters_at_their_start(ros: Ros):
     assert [(excerpt, output) for excerpt, output in pairs if excerpt not in output] == []
 
 
-def test_parameters_of_other_nodes_in_a_shared_file_are_logged_in_one_line(ros: Ros, tmp_path: Path):
-    file = tmp_path / "parameters.yaml"
-    file.write_text("/**:\n  ros__parameters: {model: '', rate: 2.0, height: 1.0, anchors: a.yaml}\n")
-    driver = ros.start("driver", arguments=("--params-file", str(file)))
-    driver.wait_for_output("replaying")
-    (line,) = [line for line in driver.output.splitlines() if "parameters of other nodes" in line]
-    assert "[INFO]" in line
-    assert line.endswith("anchors, height, model")
-
-
 def test_live_parameters_survive_a_respawn(ros: Ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv(RESPAWN_FOLDER, str(tmp_path))
     mitigator = ros.start("mitigator", "offsets:=0.1")
@@ -142,16 +132,21 @@ def test_state_of_a_crashed_node_is_loaded_once_and_only_if_it_is_new_and_valid(
     assert StateFile(None, logger).load(30.0, dict) is None
 
 
-def test_topics_can_be_remapped_and_the_frame_is_a_parameter(ros: Ros, tmp_path: Path):
-    bag = tmp_path / "no_frames.mcap"
+def test_topics_can_be_remapped_and_files_may_contain_parameters_of_other_nodes(ros: Ros, tmp_path: Path):
+    bag, file = tmp_path / "no_frames.mcap", tmp_path / "parameters.yaml"
+    file.write_text("/**:\n  ros__parameters: {model: '', rate: 2.0, height: 1.0, anchors: a.yaml}\n")
     source = SimulatedSource(seed=1, count=5)
     write_records(bag, (Record(replace(record.measurement, frame_id="")) for record in source))
     received = ros.collect(RangeCir, "/elsewhere")
     given = ("source:=mcap", f"path:={bag}", "frame_id:=mast", *PAUSED)
-    ros.start("driver", *given, arguments=("-r", "uwb/range_raw:=/elsewhere"))
+    arguments = ("-r", "uwb/range_raw:=/elsewhere", "--params-file", str(file))
+    driver = ros.start("driver", *given, arguments=arguments)
     ros.play()
     ros.spin_until(lambda: len(received) == 5)
     assert {message.header.frame_id for message in received} == {"mast"}
+    (line,) = [line for line in driver.output.splitlines() if "parameters of other nodes" in line]
+    assert "[INFO]" in line
+    assert line.endswith("anchors, height, model")
 
 
 @pytest.mark.parametrize("row", [row for table in TABLES.values() for row in table], ids=lambda row: row.name)

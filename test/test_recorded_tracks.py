@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_material import record, write_records
+from bag_material import record, without_cir, write_records
 from command_line import run, succeed
 from drives import HALL, drive
 
@@ -34,14 +34,7 @@ from uwb_mitigation.positioning.tag_locator import TagLocator
 from uwb_mitigation.positioning.track_settings import TrackSettings
 from uwb_mitigation.recordings.bag.anchor_markers import read_anchors
 from uwb_mitigation.recordings.recorded_ranges import RangeTable
-from uwb_mitigation.types.measurement import (
-    Cir,
-    CorrectedBy,
-    CorrectedRange,
-    RangeMeasurement,
-    Record,
-    Status,
-)
+from uwb_mitigation.types.measurement import CorrectedBy, CorrectedRange, Record, Status
 from uwb_mitigation.types.offsets import read_offsets
 from uwb_mitigation.types.ros.codec import measurement_key
 from uwb_mitigation.viewer.headline import cards
@@ -68,7 +61,7 @@ def imported(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path | None]
     def import_once(source: Path | None) -> Path:
         folder = tmp_path_factory.mktemp("imported")
         if source is None:
-            succeed("data simulate --like drive --ranges 500 -o raw.mcap", folder=folder)
+            succeed("data simulate --like drive --ranges 300 -o raw.mcap", folder=folder)
         elif source.exists():
             name = ["--map", "labyrinth"] if source == LABYRINTH else []
             succeed("data", "import", source, *name, "-o", "raw.mcap", folder=folder)
@@ -171,8 +164,7 @@ def test_stamps_in_another_unit_are_reported():
     ranges, _ = drive(seconds=8)
     locator = TagLocator(HALL, height_m=1.0)
     for row in range(len(ranges)):
-        anchor, range_m = HALL.anchors[ranges.anchor[row]].id, float(ranges.range_m[row])
-        locator.add(RangeMeasurement(row, 7, anchor, row, 0, range_m, Cir(np.zeros(0, np.int16))))
+        locator.add(replace(without_cir(ranges, row), stamp_ns=row))
     assert "stamps must be nanoseconds" in locator.warnings()[0]
 
 
@@ -181,10 +173,8 @@ def test_radio_without_cirs_is_located_live_as_from_raw_ranges():
     raw, passed, mixed = (TagLocator(HALL, height_m=1.0) for _ in range(3))
     table = RangeTable()
     for row in range(len(ranges)):
-        anchor, range_m = HALL.anchors[ranges.anchor[row]].id, float(ranges.range_m[row])
-        measurement = RangeMeasurement(
-            int(ranges.stamp_ns[row]), 7, anchor, row, 0, range_m, Cir(np.zeros(0, np.int16))
-        )
+        measurement = without_cir(ranges, row)
+        range_m = measurement.range_m
         result = CorrectedRange(range_m, range_m, 0.0, 0.25, Status.NO_CIR, CorrectedBy.HOST, 1)
         expected, found = raw.add(measurement), passed.add(measurement, result)
         result = replace(result, status=Status.OK) if row == 100 else result

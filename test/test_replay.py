@@ -88,6 +88,7 @@ class Player:
         self,
         source: ListSource,
         on_record: Callable[[Player, int], None] = lambda player, sequence: None,
+        replay_clock: CountedTime | None = None,
         **options: object,
     ) -> None:
         self.clock = Clock(clock_type=ClockType.STEADY_TIME)
@@ -102,6 +103,7 @@ class Player:
         self.on_record = on_record
         parameters = (DEFAULTS | options).__getitem__
         self.feed = ReplayFeed(source, self.clock, parameters, SILENT, self, self.end)
+        self.feed._clock = replay_clock or self.feed._clock
 
     def publish_records(self, records: Sequence[tuple[Record, int]]) -> None:
         self.batches.append(len(records))
@@ -188,9 +190,7 @@ class CountedTime:
 @pytest.mark.parametrize("publish_clock", [True, False])
 def test_loop_continues_in_time_and_never_publishes_negative_times(publish_clock: bool):
     source = ListSource([0, 10 * MS, 20 * MS])
-    player = Player(source, stop_after(7), loop=True, publish_clock=publish_clock)
-    player.feed._clock = CountedTime()
-    player.play()
+    player = Player(source, stop_after(7), CountedTime(), loop=True, publish_clock=publish_clock).play()
     assert player.recorded == [step % 3 * 10 * MS for step in range(7)]
     if publish_clock:
         assert min(player.clock_times) >= 0
@@ -252,9 +252,7 @@ def test_interruption_between_two_clock_readings_is_no_clock_step(monkeypatch: p
 def test_source_that_cannot_keep_its_rate_is_reported():
     source, clock = ListSource([each * 1000 for each in range(120)]), CountedTime()
     source.before = lambda index: clock.advance(5 * MS)
-    player = Player(source)
-    player.feed._clock = clock
-    player.play()
+    player = Player(source, replay_clock=clock).play()
     _, level, text, values = player.feed.describe()
     assert float(values["behind s"]) > 0.5
     assert level > b"\0"
@@ -330,9 +328,7 @@ def test_late_records_are_published_in_batches_and_in_order():
     second_ns = 10**18 + 10**9
     source = ListSource([10**18, *range(second_ns, second_ns + 499_000, 1000)])
     clock = CountedTime()
-    player = Player(source, lambda player, sequence: clock.advance(1100 * MS) if sequence == 0 else None)
-    player.feed._clock = clock
-    player.play()
+    player = Player(source, lambda _, sequence: sequence or clock.advance(1100 * MS), clock).play()
     assert player.sequences == list(range(500))
     assert max(player.batches) > 1
     # The second record is not due yet.
@@ -416,9 +412,7 @@ def test_respawned_driver_records_to_a_new_file_and_does_not_repeat_a_recording_
 def test_time_to_open_a_source_does_not_make_its_first_records_late():
     source, clock = ListSource([0, 10 * MS, 20 * MS]), CountedTime()
     source.before = lambda index: index or clock.advance(300 * MS)
-    player = Player(source)
-    player.feed._clock = clock
-    player.play()
+    player = Player(source, replay_clock=clock).play()
     assert player.stamps[0] >= 300 * MS
     assert np.diff(player.stamps).tolist() == [10 * MS] * 2
 

@@ -23,13 +23,12 @@ OWN = np.array([0.2, -0.1, 0.05, -0.2, 0.05])
 
 
 def distances(path, ranges):
-    """Return the true ranges, m."""
     return np.linalg.norm(path.position - HALL.position[ranges.anchor], axis=1)
 
 
-def level_poses(path):
+def level_poses(stamp_ns, position):
     """Return poses without turns."""
-    return PosePath(path.stamp_ns, path.position, np.tile([0.0, 0.0, 0.0, 1.0], (len(path.stamp_ns), 1)))
+    return PosePath(stamp_ns, position, np.tile([0.0, 0.0, 0.0, 1.0], (len(stamp_ns), 1)))
 
 
 def with_own(ranges: Ranges, own=OWN) -> Ranges:
@@ -110,12 +109,12 @@ def test_noisy_localisation_is_smoothed_and_keeps_its_turns():
     rng = np.random.default_rng(3)
     stamp = np.arange(1200) * 25_000_000 + rng.integers(0, 10_000_000, 1200)
     true = circuit(stamp / 1e9 * 3.0)
-    rough = PosePath(stamp, true + rng.normal(0, 0.02, true.shape), np.tile([0.0, 0.0, 0.0, 1.0], (1200, 1)))
+    rough = level_poses(stamp, true + rng.normal(0, 0.02, true.shape))
     left = rough.smoothed().position - true
     assert np.abs(left.mean(axis=0)).max() < 0.002
     assert left.std() < 0.012
     # Too few poses for a parabola are left unchanged.
-    few = PosePath(rough.stamp_ns[::10], rough.position[::10], rough.orientation[::10])
+    few = level_poses(rough.stamp_ns[::10], rough.position[::10])
     assert (few.smoothed().position == few.position).all()
 
 
@@ -145,6 +144,8 @@ def test_unobservable_calibration_is_refused(recorded):
     still, _ = drive(seconds=30, rate_hz=25.0, path=lambda t: circuit(0 * t))
     refused("moves by", HALL, [still], height=LEVEL)
     refused("too few", HALL, [ranges.take(ranges.stamp_ns < 6 * 10**9)], height=LEVEL)
+    feet = replace(ranges, range_m=ranges.range_m / 0.3048)
+    refused("if the ranges were in feet", HALL, [feet], height=LEVEL)
 
 
 def test_track_with_two_mirror_images_is_refused():
@@ -168,7 +169,9 @@ def test_track_with_two_mirror_images_is_refused():
 def test_anchors_at_wrong_positions_are_named_by_their_ids(recorded, rows, places, named):
     position = HALL.position.copy()
     position[rows] = places
-    refused(named, HALL.moved(position, HALL.sd), [recorded[0]], height=LEVEL)
+    # Each anchor has 20 independent errors.
+    ranges = recorded[0].take(recorded[0].stamp_ns < 40 * 10**9)
+    refused(named, HALL.moved(position, HALL.sd), [ranges], height=LEVEL)
 
 
 def test_four_anchors_show_a_displacement_that_the_track_follows():
@@ -195,11 +198,6 @@ def test_four_anchors_show_a_displacement_that_the_track_follows():
     # Along a line, offsets of the anchors explain the same ranges.
     (note,) = notes((4.0, 0.5), (0.5, -0.6))
     assert re.match(r"a position of anchor . that is wrong by up to 0.9 m is not noticed", note), note
-
-
-def test_ranges_in_feet_are_refused(recorded):
-    feet = replace(recorded[0], range_m=recorded[0].range_m / 0.3048)
-    refused("if the ranges were in feet", HALL, [feet], height=LEVEL)
 
 
 def test_positions_of_a_carried_tag_without_pauses_are_refused():
@@ -262,7 +260,7 @@ def test_anchor_with_one_range_has_a_large_standard_deviation(recorded):
 
 def test_area_excludes_the_mirror_image_in_a_plane():
     flat = HALL.moved(HALL.position * (1, 1, 0) + (0, 0, 2.5), HALL.sd)
-    ranges, _ = drive(flat, seconds=150, rate_hz=10.0, offset_m=0.4)
+    ranges, _ = drive(flat, seconds=100, rate_hz=10.0, offset_m=0.4)
     found = self_calibrate(flat, [ranges], area=Area((-1.0, -1.0, 0.0), (13.0, 10.0, 2.0)))
     assert found.pair(0, 0)[0] == pytest.approx(0.4, abs=0.06)
     assert found.fit.position[:, 2].max() < 2.5
@@ -287,8 +285,9 @@ def test_time_offset_is_given_or_within_the_localisation_and_the_arm_needs_turns
     with pytest.raises(DatasetError, match="time span of the localisation"):
         align_poses(HALL, [ranges], [late.shifted(10**13)], nothing)
     short, nothing = ranges.take(ranges.stamp_ns < 10**10), Regressors.none(100)
+    poses = [level_poses(path.stamp_ns, path.position)]
     with pytest.raises(DatasetError, match="cannot be separated"):
-        align_poses(HALL, [short], [level_poses(path)], nothing, time_offset_s=0.0, estimate_lever_arm=True)
+        align_poses(HALL, [short], poses, nothing, time_offset_s=0.0, estimate_lever_arm=True)
 
 
 def test_each_tag_has_its_own_lever_arm_and_its_own_body(recorded):
@@ -325,7 +324,7 @@ def test_measured_heights_replace_a_constant_one():
     def up_and_down(time_s):
         return circuit(time_s) + np.stack([0 * time_s, 0 * time_s, np.sin(0.5 * time_s)], axis=1)
 
-    ranges, path = drive(seconds=60, rate_hz=20.0, offset_m=0.25, path=up_and_down)
+    ranges, path = drive(seconds=60, rate_hz=10.0, offset_m=0.25, path=up_and_down)
     truth = distances(path, ranges)
     measured, uncertain = (
         self_calibrate(HALL, [ranges], heights_m=path.position[:, 2], height_sd_m=sd) for sd in (0.1, 0.5)

@@ -71,7 +71,6 @@ class FaultyBoard(EmulatedBoard):
 
 @pytest.fixture
 def link(tmp_path: Path) -> Path:
-    """Return the path of the port that the driver opens."""
     return tmp_path / "port"
 
 

@@ -141,16 +141,13 @@ def test_levels_follow_the_manuals_formulas() -> None:
         np.testing.assert_allclose(reported, expected, atol=0.01)
 
 
-def test_weak_level_is_reported_as_sent_and_a_strong_one_is_compressed() -> None:
+def test_weak_level_is_as_sent_a_strong_one_is_compressed_and_below_the_sensitivity_there_is_none() -> None:
     weak = QUIET.receive(lone_paths(50, -80.0), rng())
     np.testing.assert_allclose(weak.rx_power_dbm, QUIET.tx_power_dbm - 80.0, atol=1.0)
     strong = QUIET.receive(lone_paths(50, -40.0), rng())
     np.testing.assert_allclose(strong.rx_power_dbm, QUIET.compression_dbm, atol=0.5)
-
-
-def test_frame_below_the_sensitivity_is_not_received() -> None:
-    reception = QUIET.receive(lone_paths(5, -90.0), rng())
-    assert np.isnan([reception.first_path_index, reception.rx_power_dbm]).all()
+    lost = QUIET.receive(lone_paths(5, -90.0), rng())
+    assert np.isnan([lost.first_path_index, lost.rx_power_dbm]).all()
 
 
 def test_gain_belongs_to_its_anchor() -> None:

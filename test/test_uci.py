@@ -80,28 +80,23 @@ class Bench:
         if answer:
             self.measured_ranges += self.session.receive(answer, self.now_ns, self.now_ns)
 
-    def wait(self, seconds: float) -> Bench:
+    def wait(self, seconds: float, until: Callable[[str], bool] = lambda state: False) -> Bench:
+        """Run for a time, or until the state of the session fulfils a condition."""
         for _ in range(round(seconds / 0.005)):
             self.step()
+            if until(self.session.state):
+                break
         return self
 
-    def wait_for(self, state: str, seconds: float = 20.0) -> str:
+    def wait_for(self, text: str) -> str:
         """Wait until the state contains a text; return it."""
-        for _ in range(round(seconds / 0.005)):
-            self.step()
-            if state in self.session.state:
-                break
-        return self.session.state
+        return self.wait(20.0, lambda state: text in state).session.state
 
     def start(self, seconds: float = 10.0) -> Bench:
-        for _ in range(round(seconds / 0.005)):
-            self.step()
-            if not self.session.state:
-                return self
-        raise AssertionError(self.session.state)
+        assert self.wait(seconds, lambda state: not state).session.state == ""
+        return self
 
     def start_again(self) -> Bench:
-        """Open the port once more."""
         self.session.closed(0)
         self.session.opened(self.now_ns)
         return self.start()
@@ -112,6 +107,12 @@ class Bench:
         while not self.session.stopped:
             self.step()
         return self.board._calibration
+
+    def port(self) -> UciPort:
+        settings = UciPortSettings(PortAddress("/dev/no"), self.session.settings)
+        port = UciPort(settings, (0, None, print, lambda: 0))
+        port.session = self.session
+        return port
 
     def range(self, sequence: int, distance_m: float = 3.0) -> bytes:
         return self.board.range_packet(self.handle, sequence, distance_m)
@@ -166,12 +167,10 @@ def test_a_range_notification_of_a_real_board_is_parsed():
     messages.parse_ranges(RANGE + b"\0")
     with pytest.raises(LinkError):
         messages.parse_ranges(RANGE + RANGE_PACKET)
-
-
-@pytest.mark.parametrize(("position", "value"), [(27, b"\x21\xff"), (29, b"\xff\xff")])
-def test_a_failed_or_invalid_range_has_no_distance(position: int, value: bytes):
-    data = RANGE[:position] + value + RANGE[position + 2 :]
-    assert np.isnan(messages.parse_ranges(data).records[0].range_m)
+    # A failed and an invalid range have no distance.
+    for position, value in ((27, b"\x21\xff"), (29, b"\xff\xff")):
+        data = RANGE[:position] + value + RANGE[position + 2 :]
+        assert np.isnan(messages.parse_ranges(data).records[0].range_m)
 
 
 def test_the_levels_of_each_segment_are_parsed():
@@ -372,9 +371,7 @@ def test_a_range_of_another_session_or_peer_is_ignored():
     run.step(ms=500)
     assert not run.measured_ranges
     assert run.session.counts["unknown_session"] >= 2
-    port = UciPort(UciPortSettings(PortAddress("/dev/no"), run.session.settings), (0, None, print, lambda: 0))
-    port.session = run.session
-    assert port.report().warning.startswith("the only ranges are of other addresses")
+    assert run.port().report().warning.startswith("the only ranges are of other addresses")
 
 
 def test_ranges_are_published_in_order_and_soon_after_a_lost_cir():
@@ -471,8 +468,7 @@ def test_the_benchmark_finds_no_wrong_join_but_would_find_one(monkeypatch: pytes
 )
 def test_ranges_without_cir_are_explained_by_damages_and_rejected_parameters(keep, warning: str):
     run = Bench(UciBoardModel(rejects=frozenset([0x2D])), window=157).start()
-    port = UciPort(UciPortSettings(PortAddress("/dev/no"), run.session.settings), (0, None, print, lambda: 0))
-    port.session = run.session
+    port = run.port()
     for sequence in range(1, 60):
         port.monitor.add_range(time.monotonic())
         run.step(run.range(sequence), 5.0)
@@ -890,11 +886,16 @@ def killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> UciBoardModel:
     return run.board
 
 
+def restarted(board: UciBoardModel, port: str = "/dev/ttyACM0") -> Bench:
+    """Return the next driver of a board."""
+    return Bench(board, OriginalsFile(port), window=157).start()
+
+
 @pytest.mark.parametrize("port", ["/dev/ttyACM0", "/dev/ttyACM1"])
 def test_calibration_is_restored_after_the_driver_was_killed(
     killed: UciBoardModel, tmp_path: Path, port: str
 ):
-    assert Bench(killed, OriginalsFile(port), window=157).start().stop() == UciBoardModel()._calibration
+    assert restarted(killed, port).stop() == UciBoardModel()._calibration
     assert not list(tmp_path.rglob("*.json"))
 
 
@@ -915,17 +916,16 @@ def test_calibration_at_a_port_in_use_is_not_that_of_another_board_with_its_id(
 
 @pytest.mark.parametrize("silent", [codes.GET_CALIBRATION, codes.SET_CALIBRATION], ids=["read", "write"])
 def test_original_calibration_is_kept_until_it_was_restored(killed: UciBoardModel, silent: tuple[int, int]):
-    run, usual = Bench(killed, OriginalsFile("/dev/ttyACM0"), window=157).start(), killed._command
+    run, usual = restarted(killed), killed._command
     killed._command = lambda name, *rest: b"" if name == silent else usual(name, *rest)
     assert run.stop()[TAPS] == 157
     killed._command = usual
-    restored = Bench(killed, OriginalsFile("/dev/ttyACM0"), window=157).start().stop()
-    assert restored == UciBoardModel()._calibration
+    assert restarted(killed).stop() == UciBoardModel()._calibration
 
 
 def test_calibration_that_another_program_has_changed_is_kept(killed: UciBoardModel):
     killed._calibration[TAPS] = 64
-    assert Bench(killed, OriginalsFile("/dev/ttyACM0"), window=157).start().stop()[TAPS] == 64
+    assert restarted(killed).stop()[TAPS] == 64
 
 
 @pytest.mark.parametrize(
@@ -934,7 +934,7 @@ def test_calibration_that_another_program_has_changed_is_kept(killed: UciBoardMo
 def test_damaged_files_of_the_calibration_are_ignored(killed: UciBoardModel, tmp_path: Path, text: str):
     (path,) = tmp_path.rglob("*.json")
     path.write_text(text)
-    assert Bench(killed, OriginalsFile("/dev/ttyACM0"), window=157).start().session.window == (157, 5)
+    assert restarted(killed).session.window == (157, 5)
 
 
 # Captures --------------------------------------------------------------------------------------------------------

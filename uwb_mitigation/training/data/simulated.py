@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 
@@ -32,13 +33,16 @@ def building_dataset(
     """Return one range of each of the first `blocks` x 256 placements of `sources.simulated`, in its order.
 
     Ranges that are not received, or whose window is not usable, are omitted. The result does not depend on the number
-    of `workers` (processes); `on_block` is called after each block. `radio`, `wide_share`: see `block_of`.
+    of `workers` (processes; 1: this one); `on_block` is called after each block. `radio`, `wide_share`: see `block_of`.
     """
     simulate = partial(block_dataset, seed, preprocessing, radio, wide_share)
     blocks_of_ranges = []
-    # Do not fork: the caller may run threads (torch, a progress bar).
-    with multiprocessing.get_context("spawn").Pool(workers) as pool:
-        for block in pool.imap(simulate, range(blocks)):
+    with ExitStack() as stack:
+        run: Callable[..., Iterable[Dataset]] = map
+        if workers > 1:
+            # Do not fork: the caller may run threads (torch, a progress bar).
+            run = stack.enter_context(multiprocessing.get_context("spawn").Pool(workers)).imap
+        for block in run(simulate, range(blocks)):
             blocks_of_ranges.append(block)
             on_block()
     return replace(Dataset.joined(blocks_of_ranges), radios=(radio.kind,), segments=(radio.segment,))
