@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.recordings.bag.pose_paths import read_topic, sorted_rows
 from uwb_mitigation.recordings.bag.writer import BagWriter
-from uwb_mitigation.types.ros.poses import UNOBSERVED, header_fields, quaternion, vector, yaw_of
+from uwb_mitigation.types.ros.poses import UNOBSERVED, header_fields, odometry_cdr, quaternion, vector, yaw_of
 from uwb_mitigation.types.ros.schemas import serialize
 from uwb_mitigation.types.ros.topics import IMU_TYPE, ODOMETRY_TYPE, ROBOT_IMU, ROBOT_ODOMETRY, TF, TF_TYPE
 from uwb_mitigation.types.stamps import to_ns
@@ -31,13 +31,9 @@ def encode_odometry_row(odometry: Odometry, row: int) -> bytes:
     vx, vy, yaw_rate = odometry.twist[row].tolist()
     pose = Fields(position=vector(x, y), orientation=quaternion(yaw))
     twist = Fields(linear=vector(vx, vy), angular=vector(z=yaw_rate))
-    return serialize(
-        ODOMETRY_TYPE,
-        header=header_fields(int(odometry.stamp_ns[row]), ODOM),
-        child_frame_id=BASE_LINK,
-        pose=Fields(pose=pose, covariance=_six(odometry.pose_covariance[row])),
-        twist=Fields(twist=twist, covariance=_six(odometry.twist_covariance[row])),
-    )
+    pose = Fields(pose=pose, covariance=_six(odometry.pose_covariance[row]))
+    twist = Fields(twist=twist, covariance=_six(odometry.twist_covariance[row]))
+    return odometry_cdr(int(odometry.stamp_ns[row]), (ODOM, BASE_LINK), pose, twist)
 
 
 def encode_imu_row(imu: Imu, row: int) -> bytes:

@@ -97,13 +97,14 @@ def encode_odometry(
         velocity = Fields(linear=vector(twist.vx, twist.vy), angular=vector(z=twist.yaw_rate))
         variances = (twist.speed_variance, twist.speed_variance, *[UNOBSERVED] * 3, twist.yaw_rate_variance)
         np.fill_diagonal(covariance, variances)
-    return serialize(
-        ODOMETRY_TYPE,
-        header=header_fields(estimate.stamp_ns, frame_id),
-        child_frame_id=child_frame_id,
-        pose=_pose(estimate),
-        twist=Fields(twist=velocity, covariance=covariance.ravel()),
-    )
+    motion = Fields(twist=velocity, covariance=covariance.ravel())
+    return odometry_cdr(estimate.stamp_ns, (frame_id, child_frame_id), _pose(estimate), motion)
+
+
+def odometry_cdr(stamp_ns: int, frames: tuple[str, str], pose: Fields, twist: Fields) -> bytes:
+    """Return `nav_msgs/Odometry` in CDR from its fields; `frames`: of the pose, and of the tag or the robot."""
+    header = header_fields(stamp_ns, frames[0])
+    return serialize(ODOMETRY_TYPE, header=header, child_frame_id=frames[1], pose=pose, twist=twist)
 
 
 def encode_true_position(
