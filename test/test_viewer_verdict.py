@@ -72,6 +72,20 @@ def test_good_position_has_its_accuracy_age_and_share_of_corrected_ranges():
     )
 
 
+def test_anchor_that_is_not_where_the_file_says_is_named_while_the_tag_moves():
+    scene, clock = driven(count=1)
+    for angle in np.arange(0.0, 40.0, 0.1).tolist():
+        clock.now_s += 0.1
+        x, y, stamp_s = 4.0 + 3.0 * math.cos(angle), 3.0 + 2.0 * math.sin(angle), clock.now_s + 900.0
+        scene.add_pose("tag_7", Pose(x, y, 0.0, stamp_s=stamp_s, sd_m=0.1))
+        for anchor, (anchor_x, anchor_y) in (ANCHORS | {2: (8.0, 0.8)}).items():
+            range_m = math.hypot(x - anchor_x, y - anchor_y)
+            scene.add_sample((anchor, 7), Sample(stamp_s, range_m, range_m, 0.1, Status.OK))
+    state, reason, action, _ = controls(scene).verdict
+    assert (state, reason) == ("degraded", "Anchor door is probably not where the anchors file says")
+    assert action.startswith("At least 0.8 m away")
+
+
 def test_anchor_that_reads_long_degrades_the_position_by_its_name():
     scene, _ = driven({2: 0.6})
     state, reason, action, _ = controls(scene).verdict

@@ -38,7 +38,7 @@ class ResidualDirections:
     def add(self, range_m: float, position: tuple[float, ...], anchor: tuple[float, ...]) -> None:
         """Add a range, with the position of the antenna and the anchor's, x, y, z in m."""
         distance_m = math.dist(position, anchor)
-        if distance_m == 0.0:
+        if distance_m == 0.0 or not math.isfinite(range_m):
             return
         if not self._places or math.dist(position[:2], self._places[-1][:2]) > STEP_M:
             self._places.append([*position[:2], 0.0, 0.0, 0.0, 0.0])
@@ -78,7 +78,7 @@ def _displacement(
     return float(np.hypot(*state[:2])), losses[0] - losses[1]
 
 
-def displaced(anchors: Mapping[Key, ResidualDirections]) -> tuple[Key, float] | None:
+def displaced_anchor(anchors: Mapping[Key, ResidualDirections]) -> tuple[Key, float] | None:
     """Return the anchor that is probably displaced, and by how much at least, m; None: no anchor stands out."""
     fits = sorted(
         ((*anchor.fit(), key) for key, anchor in anchors.items()), key=lambda fit: fit[1], reverse=True

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.positioning.health import NO_DATA_INTERVALS, NO_DATA_S
+from uwb_mitigation.positioning.residual_directions import ResidualDirections
 from uwb_mitigation.types.measurement import FAULTS, LINE_OF_SIGHT_DB, Cir, Encoding
 
 MAX_SAMPLES = 6000
@@ -200,6 +201,7 @@ class History(Rows[Sample]):
 
     Attributes:
         cir: the last CIR of a stream.
+        directions: its residuals at the latest places of the tag.
     """
 
     kind = Sample
@@ -208,6 +210,7 @@ class History(Rows[Sample]):
         super().__init__(rows)
         self._outages = outages or Outages()
         self.cir: Cir | None = None
+        self.directions = ResidualDirections()
 
     @property
     def is_interrupted(self) -> bool:

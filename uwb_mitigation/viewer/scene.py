@@ -310,7 +310,9 @@ class Scene:
         if abs(pose.stamp_s - sample.stamp_s) * pose.speed > MAX_MOVED_M:
             return math.nan
         x, y, z = anchor.position
-        return float(sample.corrected_m) - math.hypot(pose.x - x, pose.y - y, finite_or_zero(pose.z - z))
+        tag, anchor_place = (pose.x, pose.y, finite_or_zero(pose.z - z)), (x, y, 0.0)
+        self.pairs[pair].directions.add(sample.corrected_m, tag, anchor_place)
+        return float(sample.corrected_m) - math.dist(tag, anchor_place)
 
     def _locate_raw(self, pair: Pair, pose: Pose, sample: Sample) -> None:
         """Filter the raw ranges of a tag as the locator filters the corrected ones, at the height of the locator."""

@@ -12,6 +12,7 @@ from uwb_mitigation.errors import format_id
 from uwb_mitigation.positioning import health
 from uwb_mitigation.positioning.determination import UNKNOWN_POSITION
 from uwb_mitigation.positioning.health import NO_DATA_S, Means, Verdict
+from uwb_mitigation.positioning.residual_directions import ResidualDirections, displaced_anchor
 from uwb_mitigation.viewer.headline import Card, cards
 from uwb_mitigation.viewer.histories import HISTORY_S, RATE_RANGES, STATISTICS, Pair
 from uwb_mitigation.viewer.scene import Scene, plain_tag_id, tag_label, tag_name
@@ -106,13 +107,17 @@ class Texts:
         """Write the table of pairs; return their means."""
         displaced = self._view.timeline.displaced
         rows, pairs = list[tuple[Any, ...]](), dict[Pair, Means]()
+        by_tag = defaultdict[int, dict[Pair, ResidualDirections]](dict)
+        for pair, history, _ in scene.latest():
+            by_tag[pair[1]][pair] = history.directions
+        moved = dict(found for directions in by_tag.values() if (found := displaced_anchor(directions)))
         for pair, history, sample in scene.latest():
             missing, age_s = scene.no_data(history), scene.age_s(sample)
             means = dict.fromkeys(history.statistics(), math.nan) if missing else history.statistics()
             means |= {
                 "rate": 0.0 if missing else history.rate_hz(scene.stamp_age_s(pair)),
                 "stopped": age_s if missing else 0.0,
-                "displaced": 0.0,
+                "displaced": moved.get(pair, 0.0),
             }
             if pair[0] in displaced.keys() & scene.anchors.keys():
                 residual_m, place = displaced[pair[0]]

@@ -59,7 +59,8 @@ def anchor_means(pairs: Mapping[Pair, Means]) -> dict[int, Means]:
         means = {name: sum(column) / len(column) if column else math.nan for name, column in values.items()}
         # An anchor has stopped if all of its pairs have.
         totals = {name: sum(values[name]) for name in ("rate", "evidence")}
-        result[anchor_id] = means | totals | {"stopped": min(values["stopped"])}
+        extremes = {"stopped": min(values["stopped"]), "displaced": max(values["displaced"])}
+        result[anchor_id] = means | totals | extremes
     return result
 
 

@@ -14,7 +14,7 @@ from uwb_mitigation.positioning import health
 from uwb_mitigation.positioning.determination import current_determination
 from uwb_mitigation.positioning.health import LONG_M, NO_DATA_INTERVALS, NO_DATA_S, Means, Verdict
 from uwb_mitigation.positioning.multi_tag import TagState
-from uwb_mitigation.positioning.residual_directions import ResidualDirections, displaced
+from uwb_mitigation.positioning.residual_directions import ResidualDirections, displaced_anchor
 from uwb_mitigation.types.anchors import Anchor
 from uwb_mitigation.types.measurement import CorrectedRange, Status
 from uwb_mitigation.types.tracks import Estimate
@@ -96,7 +96,7 @@ class PositionMonitor:
     def _means(self) -> dict[int, Means]:
         """Return the means of each anchor that was received in the last minute, as the viewer has them of its pairs."""
         result, now_s = dict[int, Means](), self._now_s()
-        moved = displaced(self._directions) or (None, 0.0)
+        moved = displaced_anchor(self._directions) or (None, 0.0)
         for anchor, rows in self._residuals.items():
             received_s, residual_m, is_uncertain = np.array(rows).T
             age_s, known_m = now_s - float(received_s[-1]), residual_m[np.isfinite(residual_m)]
