@@ -377,7 +377,7 @@ def test_smoothed_track_has_headings_from_the_start():
 
 
 def test_first_sharp_turn_with_late_odometry_does_not_exceed_the_heading(data: Path):
-    run = load_geometry("hall", "5", str(data / "geometries" / GEOMETRIES), "ceiling_hall", 2, 5, 90.0)
+    run = load_geometry("hall", "24", str(data / "geometries" / GEOMETRIES), "ceiling_hall", 2, 24, 60.0)
     assert run.robot is not None
     late = replace(run.robot, odometry=odometry_faults(run.robot.odometry)["late by 1 s"])
     exceeded = track_errors(locate(run, run.ranges, late), run.truth).heading_exceeded

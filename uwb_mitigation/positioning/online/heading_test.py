@@ -64,12 +64,18 @@ FIT_SD = 1.5
 MAX_FIT_SD = math.radians(8.0)
 """A fit with a larger standard deviation confirms no heading."""
 
-LATE_SD, MIN_CHANGE, CHANGES = 3.0, math.radians(16.0), 2.5
-"""Until late stamps are excluded, a change of the yaw rate that the odometry does not show yet is within this many standard deviations of
-the heading: in the time of the delay at least this rotation, and this multiple of the range of yaw rates before."""
+MAX_SD = math.radians(15.0)
+"""A heading with a larger standard deviation is not confirmed, except with `LATE_SD`."""
+
+LATE_SD, STEADY_LATE_SD, STEADY = math.radians(30.0), math.radians(5.5), 2.5
+"""Least standard deviation of a heading until late stamps are excluded: in the time of the delay a robot can turn by 90 degrees, which
+neither the odometry nor the ranges show at once. The second is for one that turns steadily: its yaw rates differ by a smaller factor."""
 
 RATE_S = 0.5
 """Averaging time of yaw rates."""
+
+LATE_EVIDENCE = 5.0
+"""As `EXCLUDED`, of the other faults, until late stamps are excluded: a heading that is first confirmed in a sharp turn is soon wrong."""
 
 
 class HeadingTest:
@@ -81,11 +87,12 @@ class HeadingTest:
 
     Attributes:
         contradicts: the latest heading contradicted the ranges, or the odometry has a fault.
+        may_be_late: late stamps are not excluded yet.
     """
 
     def __init__(self, lever_arm: tuple[float, float, float], *, is_verified: bool = False) -> None:
         self._arm = complex(*lever_arm[:2])
-        self._evidence = [is_verified * EXCLUDED] * (len(_FAULTS) - 1)
+        self._evidence = [is_verified * evidence for evidence in (LATE_EVIDENCE, LATE_EVIDENCE, EXCLUDED)]
         self._slowest, self._fastest = math.inf, -math.inf
         self._turned, self.contradicts = (0.0, PathPoint(0)), False
         # Time, distance driven, variance, drift and turn of the odometry, position, and position relative to the start of the path for each fault.
@@ -159,18 +166,21 @@ class HeadingTest:
         difference = math.remainder(self._rotation + point.yaw - yaw, math.tau)
         limit = CONTRADICTION**2 * (variance + self._variance + self._drift)
         self.contradicts = self._is_faulty or difference * difference > limit
-        if self.contradicts or not self._is_confirmed:
+        variance = max(variance, self._variance, (difference / FIT_SD) ** 2)
+        if self.contradicts or not self._is_confirmed or variance >= MAX_SD**2:
             return math.inf
-        change = 0.0
-        if self._may_be_late:
-            change = max(CHANGES * (self._fastest - self._slowest) * _MAX_DELAY_S, MIN_CHANGE)
-        return max(variance, self._variance, (difference / FIT_SD) ** 2, (change / LATE_SD) ** 2)
+        if not self.may_be_late:
+            return variance
+        # With both signs the right side is negative.
+        is_steady = max(self._fastest, -self._slowest) < STEADY * max(self._slowest, -self._fastest)
+        return max(variance, (STEADY_LATE_SD if is_steady else LATE_SD) ** 2)
 
     def _judge(self) -> None:
         """Update what follows from evidence and fit: `variance` runs after each range."""
         *others, late = self._evidence
-        self._is_faulty, self._may_be_late = min(*others, late) < IDENTIFIED, late < EXCLUDED
-        self._is_confirmed = min(others) >= EXCLUDED and self._variance <= MAX_FIT_SD**2
+        self._is_faulty, self.may_be_late = min(*others, late) < IDENTIFIED, late < EXCLUDED
+        required = LATE_EVIDENCE if self.may_be_late else EXCLUDED
+        self._is_confirmed = min(others) >= required and self._variance <= MAX_FIT_SD**2
 
     def _fit(self) -> None:
         """Fit the latest path for each fault, and add the log likelihood ratios."""

@@ -30,7 +30,7 @@ NUM_YAWS = 8
 """Number of initial yaws."""
 
 KNOWN_YAW_SD = math.radians(15.0)
-"""The heading is known if one hypothesis remains and its standard deviation is smaller."""
+"""The heading is searched until one hypothesis remains and its standard deviation is smaller."""
 
 START_M = 0.1
 """The yaw is unobservable for a stationary robot: hypotheses start after it has driven this distance."""
@@ -44,6 +44,10 @@ SEPARATION_S = 2.0
 EQUAL_SEPARATION, REJECTED_SEPARATION = 2.0, 4.0
 """Mean squared separation, relative to the covariance, at which both solutions have equal weights, and from which the odometry is
 rejected. Two is its mean if the odometry had no errors, and the ranges-only solution those of its covariance."""
+
+APART = 10.0
+"""Squared separation, without averaging, from which a heading is withheld while late stamps of the odometry are not excluded: so the ranges
+show a sharp turn 0.7 s after its beginning. Correct odometry reaches 7.9 (simulated ellipse in a hall, two minutes at rest)."""
 
 CONSTANT_SHARE = 0.4
 """Share of the covariance of ranges only that odometry does not reduce: errors of ranges that stay the same, or return with the place."""
@@ -94,7 +98,7 @@ class RobotEstimator:
         self._heading_filter: OdometryFilter | None = None
         self._yaws: list[_HeadingHypothesis] = []
         self._begin: PathPoint | None = None
-        self._is_rejected, self._is_confirmed = False, False
+        self._is_rejected, self._is_confirmed, self._is_apart = False, False, False
         self._rejections, self._separation = 0.0, 0.0
         self._test = HeadingTest(self._robot.lever_arm, is_verified=self._robot.is_verified)
         self._recorded = deque(sorted(self._recorded_motion(), key=lambda message: message[0]))
@@ -199,7 +203,8 @@ class RobotEstimator:
             position = self._area.clip(position)
         yaw = math.remainder(heading_filter.yaw, math.tau)
         variance = self._test.variance(yaw, yaw_variance, heading_filter.point)
-        self._is_confirmed = variance < KNOWN_YAW_SD**2
+        # Ranges show a turn that late odometry hides first as a separation that averages do not contain yet.
+        self._is_confirmed = variance < math.inf and not (self._is_apart and self._test.may_be_late)
         heading: Heading | None = None
         if self._is_confirmed:
             velocity[0], velocity[1], speed_variance = heading_filter.velocity(self.odometry)
@@ -254,9 +259,10 @@ class RobotEstimator:
             self._rejections *= math.exp(-dt / FORGIVEN_S)
         # Large range errors move the ranges-only solution away from correct odometry, too.
         scale = max(state.covariance_scale(), 1.0)
+        self._is_apart = separation > APART * scale
         if self._separation < VERIFIED_SEPARATION * scale:
             self._is_rejected = False
-        elif self._separation > REJECTED_SEPARATION * scale:
+        elif self._separation > APART * scale:
             self._reset_heading("odometry wrong")
             self._rejections += 1.0
             self._is_rejected = True
