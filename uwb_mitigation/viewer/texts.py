@@ -110,7 +110,7 @@ class Texts:
         by_tag = defaultdict[int, dict[Pair, ResidualDirections]](dict)
         for pair, history, _ in scene.latest():
             by_tag[pair[1]][pair] = history.directions
-        moved = dict(found for directions in by_tag.values() if (found := displaced_anchor(directions)))
+        moved = dict(filter(None, map(displaced_anchor, by_tag.values())))
         for pair, history, sample in scene.latest():
             missing, age_s = scene.no_data(history), scene.age_s(sample)
             means = dict.fromkeys(history.statistics(), math.nan) if missing else history.statistics()

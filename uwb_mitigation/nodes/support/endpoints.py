@@ -174,8 +174,8 @@ def _translate_errors(node: LifecycleNode, topic: str) -> Iterator[None]:
     except (RuntimeError, ValueError, TypeError, AttributeError, AssertionError, ParameterException) as error:
         name = node.resolve_topic_name(topic)
         prefix = f"qos_overrides.{name}."
-        own = node.get_publisher_names_and_types_by_node(node.get_name(), node.get_namespace())
-        if name in dict(own):
+        published = node.get_publisher_names_and_types_by_node(node.get_name(), node.get_namespace())
+        if name in dict(published):
             raise ParameterError(
                 f"this node uses {name} twice", valid="two topics: see the remappings"
             ) from error
