@@ -21,7 +21,7 @@ from drives import HALL, drive
 from benchmarks.position_data import real_runs
 from uwb_mitigation.commands.offline.track import mitigation, read_config
 from uwb_mitigation.commands.positioning import track
-from uwb_mitigation.commands.support.position_options import OPTIONS
+from uwb_mitigation.commands.support.options import OPTIONS
 from uwb_mitigation.commands.view import view
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.mitigation.correction import Mitigation
