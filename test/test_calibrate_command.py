@@ -66,7 +66,7 @@ def records_of(ranges, power, value, gap=np.nan, **kind):
 
 def localisation_of(path):
     poses = PosePath(path.stamp_ns, path.position, np.tile([0.0, 0.0, 0.0, 1.0], (len(path), 1)))
-    return Localisation("/odom", [7], [[poses]], time_offset_s=0.0)
+    return Localisation("/odom", {7: [poses]}, time_offset_s=0.0)
 
 
 def calibrated(records, path=None):

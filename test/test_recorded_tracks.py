@@ -17,11 +17,11 @@ import pytest
 from bag_material import record, without_cir, write_records
 from command_line import run, succeed
 from drives import HALL, drive
-from uwb_mitigation.commands.support.position_options import OPTIONS
 
 from benchmarks.position_data import real_runs
 from uwb_mitigation.commands.offline.track import mitigation, read_config
 from uwb_mitigation.commands.positioning import track
+from uwb_mitigation.commands.support.options import OPTIONS
 from uwb_mitigation.commands.view import view
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.mitigation.correction import Mitigation

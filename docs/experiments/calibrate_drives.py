@@ -202,8 +202,8 @@ def calibrated(drive: Run, check: Run | None, *, has_truth: bool = False) -> Sit
             drive.truth.position,
             np.tile([0.0, 0.0, 0.0, 1.0], (len(drive.truth.stamp_ns), 1)),
         )
-        tag_ids = [tag.tag_id for tag in site.tags]
-        localisation = Localisation("/truth", tag_ids, [[poses]] * len(tag_ids), time_offset_s=0.0)
+        paths = {tag.tag_id: [poses] for tag in site.tags}
+        localisation = Localisation("/truth", paths, time_offset_s=0.0)
         solution = solve_with_truth(site, localisation, height=drive.height)
     else:
         solution = solve_without_truth(site, height=drive.height, area=drive.area)

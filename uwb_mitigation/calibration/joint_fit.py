@@ -332,7 +332,7 @@ class _JointProblem:
         self._x = np.zeros((knots, 2 * d))
         self._x[:, :d] = start.position[:, :d]
         self._parameters = prior.mean.copy() if start.parameters is None else start.parameters
-        self._solution: Solution | None = None
+        self._solution: Solution
         self._without_ranges = self._motion_and_priors()
         self._columns = self._columns_of_ranges()
 
@@ -356,7 +356,6 @@ class _JointProblem:
 
     def result(self) -> JointFit:
         """Return the solution."""
-        assert self._solution is not None
         d, model, observations = self._config.dims, self._config.model, self._observations
         unit, error_m = self._residuals()
         z = error_m / self._scale_m[observations.noise_group]

@@ -5,10 +5,10 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from uwb_mitigation.calibration.hypotheses import AnchorHypotheses
 from uwb_mitigation.calibration.joint_fit import medians
@@ -143,23 +143,16 @@ class Localisation:
 
     Attributes:
         topic: topic of the poses, for reports.
-        tag_ids: ids of the T tags.
-        paths: for each tag, the poses of the robot that carries it, for each recording.
-        time_offset_s, lever_arms_m, estimate_lever_arm: see `align_poses`.
+        paths: {tag id: poses of the robot that carries it, for each recording}.
+        time_offset_s, estimate_lever_arm: see `align_poses`.
+        lever_arms_m: {tag id: its lever arm, float64 (3,)}, m; without an entry it is 0.
     """
 
     topic: str
-    tag_ids: Sequence[int]
-    paths: Sequence[Sequence[PosePath]]
+    paths: Mapping[int, Sequence[PosePath]]
     time_offset_s: float | None = None
-    lever_arms_m: NDArray[np.float64] | None = None
+    lever_arms_m: Mapping[int, ArrayLike] = field(default_factory=dict)
     estimate_lever_arm: bool = False
-
-    def select(self, tag_ids: Sequence[int]) -> Localisation:
-        """Return the poses of these tags."""
-        rows = [self.tag_ids.index(tag_id) for tag_id in tag_ids]
-        arms = None if self.lever_arms_m is None else self.lever_arms_m[rows]
-        return replace(self, tag_ids=tag_ids, paths=[self.paths[row] for row in rows], lever_arms_m=arms)
 
 
 def solve_without_truth(
@@ -312,15 +305,15 @@ def solve_with_truth(
         DatasetError: another lever arm, or other anchor positions, explain the ranges much better; or too few ranges are
             within the times of the localisation.
     """
-    localisation = localisation.select([tag.tag_id for tag in site.tags])
+    ids = [tag.tag_id for tag in site.tags]
     paths = [
         PosePath.merged([path.shifted(by_ns) for path, by_ns in zip(paths, site.shift_ns, strict=True)])
-        for paths in localisation.paths
+        for paths in map(localisation.paths.__getitem__, ids)
     ]
     align = functools.partial(align_poses, site.anchors, site.tags, paths, regressors(site, has_truth=True))
     alignment = align(
         time_offset_s=localisation.time_offset_s,
-        lever_arms_m=localisation.lever_arms_m,
+        lever_arms_m=np.array([localisation.lever_arms_m.get(tag_id, np.zeros(3)) for tag_id in ids]),
         estimate_lever_arm=localisation.estimate_lever_arm,
     )
     error_m = site.ranges.range_m - alignment.distance_m
@@ -335,7 +328,7 @@ def solve_with_truth(
     aligned = replace(
         localisation,
         time_offset_s=alignment.time_offset_s,
-        lever_arms_m=alignment.lever_arm_m,
+        lever_arms_m=dict(zip(ids, alignment.lever_arm_m, strict=True)),
         estimate_lever_arm=False,
     )
     common_m, pairs = _aligned_offsets(site, alignment)

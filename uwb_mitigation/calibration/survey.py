@@ -181,7 +181,7 @@ def _fit(config: EstimatorConfig, ranges: Ranges) -> Smoothed:
     around = np.repeat(start.sd[:, None], 3, axis=1)
     if config.height is not None:
         around[:, 2] = np.minimum(around[:, 2], TAPE_M)
-    variance, anchors, fit = config.model.variances(ranges.variance_m2), start, None
+    variance, anchors = config.model.variances(ranges.variance_m2), start
     for step in _STEPS_M:
         fit = Smoother(
             replace(config, anchors=anchors),
@@ -190,7 +190,6 @@ def _fit(config: EstimatorConfig, ranges: Ranges) -> Smoothed:
             around=(start.position, around),
         ).fit(track)
         track, anchors = fit.track, anchors.moved(fit.anchors, start.sd)
-    assert fit is not None
     return fit
 
 

@@ -17,9 +17,6 @@ from uwb_mitigation.commands.support.options import check_output, check_replacea
 from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError, format_id
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from uwb_mitigation.calibration.site import SiteCalibration
     from uwb_mitigation.calibration.site_data import SiteData
     from uwb_mitigation.mitigation.model.bundle import Bundle
@@ -138,10 +135,7 @@ def calibrate(
             show_stage("estimating tracks and offsets", None)
             if truth_topic is not None:
                 paths, lever_arms_m = _poses_of_tags(bags, site, truth_topic, frames, given_arm_m)
-                ids = [tag.tag_id for tag in site.tags]
-                localisation = Localisation(
-                    truth_topic, ids, paths, time_offset, lever_arms_m, estimate_lever_arm
-                )
+                localisation = Localisation(truth_topic, paths, time_offset, lever_arms_m, estimate_lever_arm)
                 solution = solve_with_truth(site, localisation, height=settings.height)
             else:
                 solution = solve_without_truth(
@@ -216,10 +210,8 @@ def _poses_of_tags(
     topic: str,
     frames: tuple[str, str] | None,
     lever_arm_m: tuple[float, float, float] | None,
-) -> tuple[list[list[PosePath]], NDArray[np.float64]]:
-    """Return for each of T tags the poses of its body in each bag, and the lever arms (T, 3), m, by default those of the bags."""
-    import numpy as np
-
+) -> tuple[dict[int, list[PosePath]], dict[int, tuple[float, float, float]]]:
+    """Return {tag id: poses of its body in each bag}, and {tag id: its lever arm}, m, by default from the bags."""
     from uwb_mitigation.recordings.bag.pose_paths import read_bodies
     from uwb_mitigation.types.ros.poses import UWB_TAG, tag_of_frame
 
@@ -229,18 +221,19 @@ def _poses_of_tags(
             valid="transforms to the frames of the tags in the bag",
         )
     bodies = [read_bodies(bag, topic, frames) for bag in bags]
-    paths, lever_arms_m = [], np.zeros((len(site.tags), 3))
-    for number, tag in enumerate(site.tags):
+    paths: dict[int, list[PosePath]] = {}
+    lever_arms_m: dict[int, tuple[float, float, float]] = {}
+    for tag in site.tags:
         names = [
             _body_of_tag(tag.tag_id, paths_of_bag, f"{bag}, topic {topic}")
             for bag, paths_of_bag in zip(bags, bodies, strict=True)
         ]
-        paths.append([paths_of_bag[name] for name, paths_of_bag in zip(names, bodies, strict=True)])
+        paths[tag.tag_id] = [paths_of_bag[name] for name, paths_of_bag in zip(names, bodies, strict=True)]
         if lever_arm_m is not None:
-            lever_arms_m[number] = lever_arm_m
+            lever_arms_m[tag.tag_id] = lever_arm_m
         elif tag_of_frame(names[0]) is None and names[0].rpartition("/")[2] != UWB_TAG:
             from_bags = _lever_arm_in(bags, names, site.frame_ids[tag.tag_id])
-            lever_arms_m[number] = from_bags or (0.0, 0.0, 0.0)
+            lever_arms_m[tag.tag_id] = from_bags or (0.0, 0.0, 0.0)
             if from_bags is None:
                 warn(
                     f"tag {format_id(tag.tag_id)}: the bag contains no transform from {names[0] or BASE_FRAME} to the "

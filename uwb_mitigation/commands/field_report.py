@@ -85,12 +85,11 @@ def field_report(
             advance = partial(on_progress, "ranging")
             observe(source, ports, mapping, observation, capture, unplug_request, advance, console.warn)
         _correct(observation)
-        observation.problem = anonymise(observation.problem, ports)
-        observation.warnings = [anonymise(text, ports) for text in observation.warnings]
-        observation.counters = {
-            name: anonymise(str(value), ports) for name, value in observation.counters.items()
-        }
-        observation.identity = {name: anonymise(text, ports) for name, text in observation.identity.items()}
+        hidden = partial(anonymise, ports=ports)
+        observation.problem = hidden(observation.problem)
+        observation.warnings = [hidden(text) for text in observation.warnings]
+        observation.counters = {name: hidden(str(value)) for name, value in observation.counters.items()}
+        observation.identity = {name: hidden(text) for name, text in observation.identity.items()}
         checks = run_checks(observation)
         _write(folder, source, observation, checks)
         write_atomically(output, _packed(folder))

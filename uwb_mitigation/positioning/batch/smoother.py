@@ -114,7 +114,7 @@ class Smoother:
         self._without_ranges = self._motion_and_priors(len(self._offset_sd) + extra)
         self._columns = self._columns_of_ranges()
         self._x, self._shared = np.zeros((0, 0)), np.zeros(0)
-        self._solution: Solution | None = None
+        self._solution: Solution
 
     def fit(self, initial: Track, iterations: int = _ITERATIONS) -> Smoothed:
         """Return the track, starting from one that is roughly right.
@@ -137,7 +137,6 @@ class Smoother:
         return float(np.abs(self._x[:, :d] - before[:, :d]).max())
 
     def _result(self) -> Smoothed:
-        assert self._solution is not None
         x, knots, d, p = self._x, len(self._x), self._d, len(self._offset_sd)
         height, anchors = self._split()
         position, velocity = np.full((knots, 3), height), np.zeros((knots, 3))
