@@ -9,14 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from uwb_mitigation.errors import MissingDependencyError
-from uwb_mitigation.mitigation.embedded.compiling import (
-    BOARD,
-    CORRECTION,
-    WARNINGS,
-    compile_objects,
-    firmware_folder,
-    run_tool,
-)
+from uwb_mitigation.mitigation.embedded import compiling
 
 APT = "apt install gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm"
 
@@ -27,7 +20,7 @@ _COMMON = ("-std=gnu11", "-g0", "-ffunction-sections", "-fdata-sections", "-fno-
 
 _UNIT_SHIFTS = {"B": 0, "KB": 10, "MB": 20, "GB": 30}
 
-_WARNINGS = tuple(flag for flag in WARNINGS if flag != "-Wpedantic")
+_WARNINGS = tuple(flag for flag in compiling.WARNINGS if flag != "-Wpedantic")
 
 
 class Target(str, enum.Enum):
@@ -38,7 +31,11 @@ class Target(str, enum.Enum):
     DWM1001_DEV = "dwm1001_dev"
 
 
-_SOURCES = {Target.QEMU_MPS2: CORRECTION, Target.QEMU_MPS2_LINK: BOARD, Target.DWM1001_DEV: "*.c"}
+_SOURCES = {
+    Target.QEMU_MPS2: compiling.CORRECTION,
+    Target.QEMU_MPS2_LINK: compiling.BOARD,
+    Target.DWM1001_DEV: "*.c",
+}
 
 
 class Kernels(str, enum.Enum):
@@ -95,7 +92,7 @@ def compile_image(
         UwbMitigationError: the compilation fails, or the image does not fit the board.
     """
     require_tools()
-    library, boards = firmware_folder() / "src", firmware_folder() / "boards"
+    library, boards = compiling.firmware_folder() / "src", compiling.firmware_folder() / "boards"
     if not boards.is_dir():
         raise MissingDependencyError(
             "the boards of the firmware are not installed",
@@ -107,11 +104,11 @@ def compile_image(
     kind = ("-O3", "-DUWB_PORTABLE") if kernels is Kernels.PORTABLE else ("-Os",)
     options = (*_CPU, *_COMMON, *kind, *_WARNINGS, f"-I{library}")
     layers = (*library.glob(_SOURCES[board]), *(library / "cortex_m4").glob("*.S"), common / "startup.c")
-    objects = compile_objects((f"{_PREFIX}gcc",), options, tuple(sorted(layers)))
+    objects = compiling.compile_objects((f"{_PREFIX}gcc",), options, tuple(sorted(layers)))
     sources = [program] if program else sorted((boards / board.value).glob("*.c"))
     script = common / ("mps2.ld" if board.value.startswith("qemu") else "nrf52832.ld")
     linking = ("-nostartfiles", "--specs=nano.specs", "-Wl,--gc-sections", "-Wl,--print-memory-usage")
-    usage = run_tool(
+    usage = compiling.run_tool(
         [
             *(f"{_PREFIX}gcc", *options, f"-I{export}", *map(str, sources), *objects, *linking),
             *(f"-L{common}", "-T", str(script), "-o", str(elf), "-lm"),
@@ -127,4 +124,4 @@ def compile_image(
 
 def write_hex(image: Image, output: Path) -> None:
     """Write an image as Intel HEX, for the USB drive of a J-Link."""
-    run_tool([f"{_PREFIX}objcopy", "-O", "ihex", str(image.elf), str(output)])
+    compiling.run_tool([f"{_PREFIX}objcopy", "-O", "ihex", str(image.elf), str(output)])
