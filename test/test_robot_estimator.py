@@ -278,7 +278,7 @@ def test_filter_starts_with_the_antenna_of_the_range_filter():
     one = OdometryFilter(HALL, NoiseModel(), start, PathPoint(1), (0.4, -0.3, 0.2), (0.7, 0.2))
     np.testing.assert_allclose(one.antenna, start.position)
     expected = start.estimate(0).covariance
-    xx, xy, yy, *_ = one.published_covariance()
+    _, _, _, xx, xy, yy, *_ = one.published()
     np.testing.assert_allclose((xx, xy, yy), expected[[0, 0, 1], [0, 1, 1]], atol=1e-12)
 
 

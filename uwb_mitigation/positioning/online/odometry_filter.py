@@ -152,14 +152,18 @@ class OdometryFilter:
         variance = odometry.twist_variance[0] + self.yaw_variance * (x * x + y * y)
         return vx - yaw_rate * arm_y, vy + yaw_rate * arm_x, variance
 
-    def published_covariance(self) -> tuple[float, ...]:
-        """Return the covariance of x and y of the antenna and of the yaw: xx, xy, yy, x yaw, y yaw, yaw yaw (m^2, m rad, rad^2)."""
+    def published(self) -> tuple[float, ...]:
+        """Return x and y of the antenna and the yaw, and their covariance: xx, xy, yy, x yaw, y yaw, yaw yaw (m, rad)."""
+        x, y, _, yaw = self.state.x[:SCALE].tolist()
         (xx, xy, _, x_yaw), (_, yy, _, y_yaw), _, (_, _, _, yaw_yaw) = self.state.P[:SCALE, :SCALE].tolist()
-        arm_x, arm_y = self._arm(self.yaw)
+        arm_x, arm_y = self._arm(yaw)
         # Only the position: the heading depends on the odometry more than on errors of ranges.
         scale = self.state.covariance_scale()
         root = math.sqrt(scale)
         return (
+            x + arm_x,
+            y + arm_y,
+            yaw,
             scale * (xx - 2.0 * arm_y * x_yaw + arm_y * arm_y * yaw_yaw),
             scale * (xy + arm_x * x_yaw - arm_y * y_yaw - arm_x * arm_y * yaw_yaw),
             scale * (yy + 2.0 * arm_x * y_yaw + arm_x * arm_x * yaw_yaw),

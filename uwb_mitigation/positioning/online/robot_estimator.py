@@ -184,10 +184,9 @@ class RobotEstimator:
         weight = math.exp(-self._rejections) / (1.0 + math.exp(min(excess, 50.0)))
         # Python numbers are faster here than NumPy.
         covariance_at, unseen_at = covariance.item, ranges_only.unseen.item
-        x, y, _ = heading_filter.antenna
+        x, y, yaw, xx, xy, yy, x_yaw, y_yaw, yaw_variance = heading_filter.published()
         x0, y0 = position.item(0), position.item(1)
         dx, dy = x0 - x, y0 - y
-        xx, xy, yy, x_yaw, y_yaw, yaw_variance = heading_filter.published_covariance()
         of_mean = weight * (1.0 - CONSTANT_SHARE)
         rest, apart = 1.0 - of_mean, weight * (1.0 - weight)
         covariance[0, 0] = rest * covariance_at(0, 0) + of_mean * (xx + unseen_at(0, 0)) + apart * dx * dx
@@ -201,7 +200,7 @@ class RobotEstimator:
         position[0], position[1] = x0 - weight * dx, y0 - weight * dy
         if self._area is not None:
             position = self._area.clip(position)
-        yaw = math.remainder(heading_filter.yaw, math.tau)
+        yaw = math.remainder(yaw, math.tau)
         variance = self._test.variance(yaw, yaw_variance, heading_filter.point)
         # Ranges show a turn that late odometry hides first as a separation that averages do not contain yet.
         self._is_confirmed = variance < math.inf and not (self._is_apart and self._test.may_be_late)
@@ -262,7 +261,7 @@ class RobotEstimator:
         self._is_apart = separation > APART * scale
         if self._separation < VERIFIED_SEPARATION * scale:
             self._is_rejected = False
-        elif self._separation > APART * scale:
+        elif self._separation > REJECTED_SEPARATION * scale:
             self._reset_heading("odometry wrong")
             self._rejections += 1.0
             self._is_rejected = True
