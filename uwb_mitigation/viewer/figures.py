@@ -217,10 +217,10 @@ class Figures:
                 (colour, *style), label = palette.TRACK_STYLES[kind], kind.value
                 if kind is TrackKind.CORRECTED:
                     colour, label = colours.get(name, BLUE), scene.track_name
-                poses = track.columns
                 begin_s = track.last.received_s + scene.age_s(track.last) - self._page.trail_s
-                line = np.column_stack([poses.received_s, poses.x, poses.y])[poses.received_s >= begin_s]
-                rows.append((*thinned(line, NO_DATA_S)[:, 1:].astype(np.float32).T, colour, *style, label))
+                begin = np.searchsorted(track.columns.received_s, begin_s)
+                line = thinned(track.rows[begin:, [-1, 0, 1]], NO_DATA_S)[:, 1:].astype(np.float32)
+                rows.append((*line.T, colour, *style, label))
             self._sources["tracks"].data = columns_of(self._sources["tracks"], rows)
 
     def _draw_rays(self, scene: Scene) -> None:

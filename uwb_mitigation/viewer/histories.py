@@ -215,21 +215,27 @@ class History(Rows[Sample]):
     @property
     def is_interrupted(self) -> bool:
         """Whether the viewer itself has dropped ranges since the last one: the time until the next one is no interval."""
-        return bool(self._outages.last.end_s > self.last.stamp_s)
+        outages = self._outages.rows
+        return len(outages) > 0 and bool(outages[-1, 1] > self.latest_stamp_s)
 
     def outage_s(self, age_s: float) -> float:
         """Return for how long the viewer has dropped ranges since the last one, `age_s` ago."""
-        begin_s, end_s = np.clip(self._outages.rows.T - self.last.stamp_s, 0.0, age_s)
+        begin_s, end_s = np.clip(self._outages.rows.T - self.latest_stamp_s, 0.0, age_s)
         return float((end_s - begin_s).sum())
 
-    def add(self, sample: Sample, limit: int | None = None) -> None:
-        """Add a range without its interval; see `append`."""
-        interval_s = math.nan if self.is_interrupted else sample.stamp_s - self.last.stamp_s
-        self.append(sample._replace(interval_s=interval_s), limit)
+    @property
+    def latest_stamp_s(self) -> float:
+        """Stamp of the last range; NaN: there is none."""
+        return float(self._data[self._end - 1, 0]) if self._end > self._begin else math.nan
+
+    def add(self, sample: Sample, residual_m: float, received_s: float, limit: int | None = None) -> None:
+        """Add a range; see `Sample` and `append`."""
+        interval_s = math.nan if self.is_interrupted else sample.stamp_s - self.latest_stamp_s
+        self.append((*sample[:-3], residual_m, interval_s, received_s), limit)
 
     def remove_before(self, stamp_s: float) -> None:
         """Remove ranges with earlier stamps from the beginning."""
-        while self._begin < self._end and self.columns.stamp_s[0] < stamp_s:
+        while self._begin < self._end and self._data[self._begin, 0] < stamp_s:
             self._begin += 1
 
     def statistics(self) -> dict[str, float]:

@@ -173,7 +173,7 @@ class Scene:
 
         It does not depend on how fast the viewer reads them.
         """
-        return max(0.0, self.latest_stamp_s(pair[1]) - float(self.pairs[pair].last.stamp_s))
+        return max(0.0, self.latest_stamp_s(pair[1]) - self.pairs[pair].latest_stamp_s)
 
     def age_s(self, last: Sample | Pose) -> float:
         """Return the time since the last data of a pair, tag or track."""
@@ -200,7 +200,7 @@ class Scene:
         """
         tag_id, stamp_s = pair[1], sample.stamp_s
         tag_latest_s, history = self.latest_stamp_s(tag_id), self.history(pair)
-        if stamp_s < tag_latest_s - HISTORY_S or stamp_s < history.last.stamp_s - 1.0:
+        if stamp_s < tag_latest_s - HISTORY_S or stamp_s < history.latest_stamp_s - 1.0:
             tag_latest_s = math.nan
             if not self.is_whole:
                 self.clear_history(tag_id)
@@ -213,11 +213,12 @@ class Scene:
         self.faults += sample.status.is_fault
         self.incidents.add_range(pair, self.clock(), stamp_s)
         self.received_s = self.clock()
-        history, sample = self.pairs[pair], sample._replace(received_s=self.received_s)
+        history = self.pairs[pair]
         if self.is_whole:
-            history.add(sample)
+            history.add(sample, math.nan, self.received_s)
         else:
-            history.add(sample._replace(residual_m=self._compare_with_position(pair, sample)), MAX_SAMPLES)
+            residual_m = self._compare_with_position(pair, sample)
+            history.add(sample, residual_m, self.received_s, MAX_SAMPLES)
             history.remove_before(tag_latest_s - HISTORY_S)
         if not math.isnan(sample.true_m):
             self.count_errors(np.array([[sample.raw_m], [sample.corrected_m]]) - sample.true_m)
