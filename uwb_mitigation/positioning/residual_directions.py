@@ -1,7 +1,6 @@
-"""Recognises an anchor that is not where the anchors file says while a tag moves: its residuals change with the direction to it.
+"""Recognises a displaced anchor while a tag moves: its residuals change with the direction to it, unlike an offset.
 
-An offset is the same in all directions, obstacles fit a displacement badly. A displaced anchor also bends the track with which
-it is compared, so the fit finds about two thirds of the displacement.
+It also bends the track with which it is compared, so the fit finds about two thirds of the displacement.
 """
 
 from __future__ import annotations
@@ -22,9 +21,9 @@ DISPLACEMENT_SD_M, OFFSET_SD_M, NOISE_SD_M = 1.0, 0.3, 0.15
 MIN_DISPLACEMENT_M, MIN_GAIN, STANDS_OUT = 0.4, 20.0, 2.0
 """Least displacement, gain in log likelihood, and its ratio to that of the next anchor. In 32 simulated drives with right anchors no anchor exceeds
 all three; half of the anchors do that are 0.8 m off. A height that is wrong by 1 m looks like a displacement in one of 16."""
-_ITERATIONS = 5
 
 Key = TypeVar("Key")
+Vector = NDArray[np.float64]
 
 
 class ResidualDirections:
@@ -50,41 +49,36 @@ class ResidualDirections:
         place[5] += (position[1] - anchor[1]) / distance_m
 
     def fit(self) -> tuple[float, float]:
-        """Return the displacement that fits best, m, and its gain in log likelihood compared with an offset alone."""
+        """Return the gain in log likelihood of a displacement compared with an offset alone, and the displacement, m."""
         if self._fit is None:
             # The last place is not complete.
             places = np.array(self._places)[:-1]
-            self._fit = (
-                (0.0, 0.0) if len(places) < MIN_PLACES else _displacement(*(places[:, 3:] / places[:, 2:3]).T)
-            )
+            is_enough = len(places) >= MIN_PLACES
+            self._fit = _displacement(*(places[:, 3:] / places[:, 2:3]).T) if is_enough else (0.0, 0.0)
         return self._fit
 
 
-def _displacement(
-    residual_m: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.float64]
-) -> tuple[float, float]:
+def _displacement(residual_m: Vector, x: Vector, y: Vector) -> tuple[float, float]:
     columns = np.stack([-x, -y, np.ones_like(x)], axis=1) / NOISE_SD_M
     information = np.array([DISPLACEMENT_SD_M, DISPLACEMENT_SD_M, OFFSET_SD_M]) ** -2
     losses = []
     for first in (2, 0):
         rows, prior, weight = columns[:, first:], information[first:], np.ones_like(x)
-        for _ in range(_ITERATIONS):
+        for _ in range(5):
             # Weights of Student's t-distribution with three degrees of freedom: some places are behind obstacles.
             normal = (rows.T * weight) @ rows + np.diag(prior)
             state = np.linalg.solve(normal, (rows.T * weight) @ residual_m / NOISE_SD_M)
             square = (residual_m / NOISE_SD_M - rows @ state) ** 2
             weight = 4.0 / (3.0 + square)
         losses.append(float(2.0 * np.log1p(square / 3.0).sum() + prior @ state**2 / 2.0))
-    return float(np.hypot(*state[:2])), losses[0] - losses[1]
+    return losses[0] - losses[1], float(np.hypot(*state[:2]))
 
 
 def displaced_anchor(anchors: Mapping[Key, ResidualDirections]) -> tuple[Key, float] | None:
     """Return the anchor that is probably displaced, and by how much at least, m; None: no anchor stands out."""
-    fits = sorted(
-        ((*anchor.fit(), key) for key, anchor in anchors.items()), key=lambda fit: fit[1], reverse=True
-    )
-    if not fits or fits[0][0] < MIN_DISPLACEMENT_M or fits[0][1] < MIN_GAIN:
+    if not anchors:
         return None
-    if len(fits) > 1 and fits[0][1] < STANDS_OUT * fits[1][1]:
-        return None
-    return fits[0][2], fits[0][0]
+    fits = sorted(((*anchor.fit(), key) for key, anchor in anchors.items()), key=lambda fit: -fit[0])
+    (gain, displacement_m, key), next_gain = fits[0], fits[1][0] if len(fits) > 1 else 0.0
+    stands_out = displacement_m >= MIN_DISPLACEMENT_M and gain >= max(MIN_GAIN, STANDS_OUT * next_gain)
+    return (key, displacement_m) if stands_out else None
