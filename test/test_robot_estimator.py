@@ -19,9 +19,9 @@ from uwb_mitigation.positioning.multi_tag import MultiTagEstimator
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.dead_reckoning import ODOMETRY_TIMEOUT_S, DeadReckoning, PathPoint
 from uwb_mitigation.positioning.online.filter import FIRST_ERROR, RangeFilter
-from uwb_mitigation.positioning.online.heading_test import HeadingTest
+from uwb_mitigation.positioning.online.heading_test import KNOWN_YAW_SD, HeadingTest
 from uwb_mitigation.positioning.online.odometry_filter import OdometryFilter
-from uwb_mitigation.positioning.online.robot_estimator import KNOWN_YAW_SD, RobotEstimator
+from uwb_mitigation.positioning.online.robot_estimator import RobotEstimator
 from uwb_mitigation.positioning.online.tag_estimator import TagEstimator
 from uwb_mitigation.positioning.track_errors import track_errors
 from uwb_mitigation.types.tracks import Imu, Odometry

@@ -35,7 +35,6 @@ MIN_RANGES = 40
 MAX_RANGES, SEARCHED = 20_000, 4000
 """The fit, and the search for the time offset, use at most this number of ranges."""
 
-
 SLOPE_S = 0.1
 """The velocity of a pose is the difference over this time before and after it."""
 

@@ -35,7 +35,6 @@ RECORDING_GAP_NS = 3_600_000_000_000
 MIN_HALF = 0.3
 """Minimum share of the ranges in each part of a recording that is divided for a test."""
 
-
 _RANGE = [("tag", "u8"), ("stamp_ns", "i8"), ("anchor", "i8"), ("range_m", "f8"), ("height_m", "f8")]
 _CIR = [("rx_power_dbm", "f4"), ("first_path_power_dbm", "f4"), ("is_usable", "?"), ("universal_m", "f8")]
 COLUMNS = np.dtype([*_RANGE, *_CIR, ("recording", "i8")])

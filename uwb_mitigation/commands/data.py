@@ -28,7 +28,6 @@ app = typer.Typer(help="Import, simulate and show recordings.", no_args_is_help=
 _STRIDE = 100
 """Number of ranges between two updates of a progress bar."""
 
-
 _LONGEST_PAUSE_S = 5.0
 
 CirOption = Annotated[

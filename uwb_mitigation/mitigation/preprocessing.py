@@ -27,7 +27,6 @@ from uwb_mitigation.types.measurement import (
 WINDOW_LEAD = 5
 """Samples of the window before floor(first path): enough to include the noise before the path."""
 
-
 PREAMBLE_DIVISOR = 60
 """Scales `magnitude / preamble_count` of the DW1000 to the order of one before the square root."""
 

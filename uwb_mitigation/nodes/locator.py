@@ -74,7 +74,6 @@ PERIOD_S = 0.2
 PREDICT_AFTER_S, PREDICT_UNTIL_S = 0.3, 30.0
 """A tag without ranges is predicted between these ages of its last range; later the covariance exceeds most halls."""
 
-
 STALE_S = 10.0
 """After this time without ranges of a tag, the diagnostics contain only its verdict: until then, it may return."""
 
@@ -221,17 +220,15 @@ class Locator(ManagedNode):
         if self._robot is not None and (warning := self._robot.warning()):
             warnings.insert(0, warning)
             self.get_logger().warning(warning, throttle_duration_sec=60.0)
-        level, text = diagnostics.OK, good or "no ranges yet"
-        if warnings:
-            level, text = diagnostics.WARN, "; ".join(warnings[:5])
+        level = diagnostics.WARN if warnings else diagnostics.OK
+        text = "; ".join(warnings[:5]) or good or "no ranges yet"
         values |= {"dropped by a queue": self._lost, "malformed": self._malformed}
         for outputs in self._outputs.values():
-            values[f"{outputs.monitor.name} lever arm"] = ",".join(
-                f"{m:.3f}" for m in self._lever_arm_of(outputs)
-            )
-            values[f"{outputs.monitor.name} position"] = sentences[outputs.monitor.name][1]
+            name = outputs.monitor.name
+            values[f"{name} lever arm"] = ",".join(f"{m:.3f}" for m in self._lever_arm_of(outputs))
+            values[f"{name} position"] = sentences[name][1]
             if outputs.monitor.age_s <= STALE_S:
-                values[f"{outputs.monitor.name} mean residuals m"] = outputs.monitor.residuals()
+                values[f"{name} mean residuals m"] = outputs.monitor.residuals()
         values |= self._meter.entries()
         values |= diagnostics.percentiles("processing", diagnostics.drain(self._processing_ns))
         return "host", level, text, values

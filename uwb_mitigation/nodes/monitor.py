@@ -32,7 +32,6 @@ REFRESH_HZ = 5
 MAX_LATENCIES = 100_000
 """Number of latest latencies in the summary; bounds the memory of a monitor that runs for days."""
 
-
 MAX_TRUTHS = 10_000
 """Number of latest truths that wait for their corrected ranges."""
 

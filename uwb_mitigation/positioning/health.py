@@ -37,7 +37,6 @@ the estimated position (m); `evidence`, number of residuals; `stopped`, age of t
 `displaced`, held-out residual (m) of an anchor whose ranges fit another position (`fit_x`, `fit_y`, `moved` from the file, m), live the
 displacement without these, else 0. NaN: unknown."""
 
-
 _FITTED = "is not where the anchors file says: its ranges fit x = {fit_x:.2f}, y = {fit_y:.2f} m, {moved:.1f} m away"
 _DISPLACED = "is probably not where the anchors file says: at least {displaced:.1f} m away, or the height of the tag is wrong"
 FAULTS = (

@@ -13,9 +13,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-STEP_M, MAX_PLACES = 1.0, 60
+STEP_M, MIN_PLACES, MAX_PLACES = 1.0, 8, 60
 """Errors within a step count once, because obstacles persist for metres. The latest places of an anchor are compared."""
-MIN_PLACES = 8
 DISPLACEMENT_SD_M, OFFSET_SD_M, NOISE_SD_M = 1.0, 0.3, 0.15
 """Prior standard deviations of the displacement and of the offset of an anchor, and that of the mean residual of a place."""
 MIN_DISPLACEMENT_M, MIN_GAIN, STANDS_OUT = 0.4, 20.0, 2.0

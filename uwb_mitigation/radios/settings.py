@@ -56,7 +56,6 @@ class RadioState(enum.IntEnum):
 MAX_ANCHORS = 32
 """Maximum number of anchors that a tag polls."""
 
-
 CHANNELS = (1, 2, 3, 4, 5, 7)
 PREAMBLES = (64, 128, 256, 512, 1024, 1536, 2048, 4096)
 RATES_KBPS = (110, 850, 6800)

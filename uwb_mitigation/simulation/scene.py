@@ -190,7 +190,6 @@ ROUTE: tuple[Point, ...] = (
 )  # fmt: skip
 """Closed route of a robot through the rooms and the doorways."""
 
-
 _BLOCK_ROWS = 1 << 16
 
 

@@ -51,7 +51,6 @@ bandwidth and another frequency."""
 HELD_OUT_SEED = 1_000_003
 """Added to the seed to get the held-out buildings for the evaluation."""
 
-
 RECIPE = FitOptions(epochs=10, learning_rate=1e-3, batch=64, dropout=0.1)
 
 

@@ -28,7 +28,6 @@ DEVICE_TIME_WRAP = 1 << 40
 SAMPLE_PERIOD_S = 1.0 / (2 * 499.2e6)
 """Spacing of accumulator samples: half a chip, 1.0016 ns (DW1000 user manual, section 7.2.38)."""
 
-
 LINE_OF_SIGHT_DB = 6.0
 """If the first path is less than this below the receive level, the link is probably LOS; at 10 dB it is NLOS (Decawave
 APS006, part 3)."""
@@ -88,7 +87,6 @@ CORRECTED = tuple(status for status in Status if status.is_corrected)
 
 FAULTS = tuple(status for status in Status if status.is_fault)
 """Statuses that need attention."""
-
 
 LINEAR_MAGNITUDES = "linear magnitudes: 10 ** (level / 20)"
 

@@ -284,13 +284,10 @@ class Imu(TimeSeries):
 GAP_S = 0.5
 """In longer gaps of the localisation the pose is unknown."""
 
-
 SMOOTHED_S = 0.2
 """Poses jitter, but less halfway between two of them: without smoothing, such time offsets would look best."""
 
-
 _MAX_NEIGHBOURS = 20
-
 
 _WORST_CONDITION = 1e6
 

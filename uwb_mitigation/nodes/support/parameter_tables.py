@@ -97,7 +97,6 @@ def _radio(name: str, default: ParameterValue, description: str, **options: Any)
 _UCI = ("role", "address", "channel", "preamble_code", "window", "anchors", "rate", "report")
 """Parameters of radios that UCI boards use, too."""
 
-
 RADIO = (
     _radio("role", "tag", "Role of the first radio: a tag ranges with anchors, an anchor answers",
            choices=("tag", "anchor")),

@@ -123,14 +123,9 @@ class LeastSquares:
         target: NDArray[np.float64],
         weight: NDArray[np.float64],
     ) -> None:
-        """Add n rows of one knot each, as `add` does, in a fraction of its time.
+        """Add n rows of one knot each in a fraction of the time of `add`.
 
-        Args:
-            knot: int (n,).
-            values: float64 (n, b), of all unknowns of the knot.
-            shared: float64 (n, q), of all shared unknowns.
-            target: float64 (n,).
-            weight: float64 (n,), inverse variances.
+        Knots int (n,), values of their unknowns (n, b) and of the shared ones (n, q), targets (n,), inverse variances (n,).
         """
         rows, b, n = len(knot), self.unknowns, self.knots * self.unknowns
         of_knots = csr_matrix((weight, knot, np.arange(rows + 1)), shape=(rows, self.knots)).T

@@ -25,7 +25,6 @@ KinematicState = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.floa
 OFFSET = 6
 FIRST_ERROR = 7
 
-
 CONTRADICTED_FACTOR = 12.0
 """Factor of published covariances while ranges contradict the position. With it, the 95 % ellipses of raw ranges past four anchors, two
 of them swapped or one 3 m off, contain 35 to 91 % of the true positions instead of 16 to 52 % (simulated, six of ten drives)."""

@@ -64,8 +64,8 @@ FIT_SD = 1.5
 MAX_FIT_SD = math.radians(8.0)
 """A fit with a larger standard deviation confirms no heading."""
 
-MAX_SD = math.radians(15.0)
-"""A heading with a larger standard deviation is not confirmed, except with `LATE_SD`."""
+KNOWN_YAW_SD = math.radians(15.0)
+"""A heading is searched, or not confirmed, while its standard deviation is larger; `LATE_SD` is in addition."""
 
 LATE_SD, STEADY_LATE_SD, STEADY = math.radians(30.0), math.radians(5.5), 2.5
 """Least standard deviation of a heading until late stamps are excluded: in the time of the delay a robot can turn by 90 degrees, which
@@ -167,7 +167,7 @@ class HeadingTest:
         limit = CONTRADICTION**2 * (variance + self._variance + self._drift)
         self.contradicts = self._is_faulty or difference * difference > limit
         variance = max(variance, self._variance, (difference / FIT_SD) ** 2)
-        if self.contradicts or not self._is_confirmed or variance >= MAX_SD**2:
+        if self.contradicts or not self._is_confirmed or variance >= KNOWN_YAW_SD**2:
             return math.inf
         if not self.may_be_late:
             return variance

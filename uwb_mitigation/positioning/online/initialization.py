@@ -16,10 +16,7 @@ from uwb_mitigation.types.tracks import Ranges, Track
 IMPLAUSIBLE = 9.0
 """Positions that are less likely than the best one by a factor of e^9 (eight thousand) are not plausible."""
 
-STEPS = 40
-"""Maximum number of steps of a descent."""
-
-_CONVERGED_M = 1e-6
+STEPS, _CONVERGED_M = 40, 1e-6
 _STUCK = 0.01
 _WALL_SD_M = 0.02
 """Standard deviation of the pseudo-measurement that keeps a position at the boundary of the area."""

@@ -19,7 +19,7 @@ import numpy as np
 from uwb_mitigation.positioning.config import EstimatorConfig, RobotData
 from uwb_mitigation.positioning.online.dead_reckoning import DeadReckoning, PathPoint
 from uwb_mitigation.positioning.online.filter import RangeFilter
-from uwb_mitigation.positioning.online.heading_test import HeadingTest
+from uwb_mitigation.positioning.online.heading_test import KNOWN_YAW_SD, HeadingTest
 from uwb_mitigation.positioning.online.initialization import IMPLAUSIBLE
 from uwb_mitigation.positioning.online.measurements import TagHeight, TagRange
 from uwb_mitigation.positioning.online.odometry_filter import OdometryFilter
@@ -28,9 +28,6 @@ from uwb_mitigation.types.tracks import Estimate, Heading, Ranges, Track, rows_o
 
 NUM_YAWS = 8
 """Number of initial yaws."""
-
-KNOWN_YAW_SD = math.radians(15.0)
-"""The heading is searched until one hypothesis remains and its standard deviation is smaller."""
 
 START_M = 0.1
 """The yaw is unobservable for a stationary robot: hypotheses start after it has driven this distance."""
@@ -57,7 +54,6 @@ VERIFIED_SEPARATION = 1.0
 
 FORGIVEN_S = 60.0
 """Time constant of the number of rejections, which reduces the weight of the odometry."""
-
 
 _SEPARATE = np.kron(np.eye(2), np.ones((3, 3)))
 """Covariances of position and velocity that are not 0 in a mixture."""

@@ -162,7 +162,6 @@ RADIO_ANCHOR = Layout(
 )
 """One anchor in the tail of a RADIO_STATUS."""
 
-
 OFFSET = Layout(
     "OFFSET",
     Field("tag_id", "Q", "ignored for the offset of an anchor"),

@@ -47,7 +47,6 @@ _TRUTH = struct.Struct("<QQIf")
 _CORRECTED = struct.Struct("<QQIffffBB2xI")
 _LENGTH = struct.Struct("<I")
 
-
 _RADIOS = {int(radio): radio for radio in RadioType}
 _SEGMENTS = {int(segment): segment for segment in Segment}
 _ENCODINGS = {int(encoding): encoding for encoding in Encoding}
