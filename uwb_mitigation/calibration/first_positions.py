@@ -11,7 +11,7 @@ from uwb_mitigation.calibration.joint_fit import KNOT_S
 from uwb_mitigation.calibration.motion_segments import Segments
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.config import EstimatorConfig
-from uwb_mitigation.positioning.online.initialization import STEPS, candidate_positions, local_optima
+from uwb_mitigation.positioning.online.initialization import candidate_positions, local_optima
 from uwb_mitigation.positioning.online.tag_estimator import TagEstimator
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Ranges, Track
@@ -30,9 +30,6 @@ NO_POSITION_LOSS = 50.0
 
 MIN_UNIT_LOSS = 5.0
 """Loss of a moment from which other units are examined."""
-
-FIRST_STEPS = STEPS // 2
-"""Steps of a descent that are enough if the loss is below `MIN_UNIT_LOSS`: more change it by less than 2e-5 of it (simulated sites)."""
 
 _Moments = list[tuple[NDArray[np.intp], NDArray[np.float64]]]
 
@@ -97,9 +94,7 @@ def likely_offset(config: EstimatorConfig, segments: Segments, expected_m: NDArr
     moments = _moments(config, segments, expected_m)
     if not moments:
         return 0.0
-    loss = _moment_losses(config, moments, FIRST_STEPS)
-    if float(loss.min()) / len(moments) >= MIN_UNIT_LOSS:
-        loss = _moment_losses(config, moments)
+    loss = _moment_losses(config, moments)
     per_moment = float(loss.min()) / len(moments)
     if per_moment >= MIN_UNIT_LOSS:
         for unit, metres in UNITS.items():
@@ -133,14 +128,13 @@ def _moments(config: EstimatorConfig, segments: Segments, expected_m: NDArray[np
     return moments
 
 
-def _moment_losses(config: EstimatorConfig, moments: _Moments, steps: int = STEPS) -> NDArray[np.float64]:
-    """Return the loss of all moments with each of `OFFSETS_M`; see `local_optima`."""
+def _moment_losses(config: EstimatorConfig, moments: _Moments) -> NDArray[np.float64]:
+    """Return the loss of all moments with each of `OFFSETS_M`."""
     total = np.zeros(len(OFFSETS_M))
     for row, value in moments:
         where, sd = config.anchors.position[row], np.full(len(row), START_SD_M)
         shifted = value - OFFSETS_M[:, None]
-        place = config.model, config.height, config.area
-        _, losses, _ = local_optima(where, shifted, sd, *place, steps)
+        _, losses, _ = local_optima(where, shifted, sd, config.model, config.height, config.area)
         loss = losses.min(axis=1)
         total += np.where(np.isfinite(loss), loss, NO_POSITION_LOSS)
     return total

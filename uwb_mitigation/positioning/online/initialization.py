@@ -16,7 +16,7 @@ from uwb_mitigation.types.tracks import Ranges, Track
 IMPLAUSIBLE = 9.0
 """Positions that are less likely than the best one by a factor of e^9 (eight thousand) are not plausible."""
 
-STEPS, _CONVERGED_M = 40, 1e-6
+_STEPS, _CONVERGED_M = 40, 1e-6
 _STUCK = 0.01
 _WALL_SD_M = 0.02
 """Standard deviation of the pseudo-measurement that keeps a position at the boundary of the area."""
@@ -91,7 +91,6 @@ def local_optima(
     model: NoiseModel,
     height: Height | None,
     area: Area | None,
-    steps: int = STEPS,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return n local optima for each of m sets of ranges, of which some are equal; see `candidate_positions`.
 
@@ -102,7 +101,6 @@ def local_optima(
         model: how robust.
         height: known height of the tag.
         area: area of the tag.
-        steps: maximum number of steps of each descent.
 
     Returns:
         positions float64 (m, n, 3), losses (m, n), infinite where implausible, and Hessians (m, n, 3, 3).
@@ -111,7 +109,7 @@ def local_optima(
     sets = len(range_m), len(x) // len(range_m)
     of_starts = np.repeat(range_m, sets[1], axis=0)
     problem = _Trilateration(anchors, of_starts, sd_m, model, *_height_prior(len(x), height))
-    x, loss, gradient, hessian = problem.descend(x, steps)
+    x, loss, gradient, hessian = problem.descend(x)
     cost = loss.reshape(sets)
     # Discard starts that have not converged, unless no start has converged.
     step = np.linalg.solve(hessian + 1e-9 * np.eye(3), gradient[..., None])[..., 0]
@@ -127,7 +125,7 @@ def local_optima(
             # Optima just outside, because of range errors: find the best positions on the boundary.
             wall = area.clip(x[outside])
             walls = problem.with_walls(outside, wall, excess[outside] != 0.0)
-            x[outside], cost.flat[outside], _, hessian[outside] = walls.descend(wall, steps)
+            x[outside], cost.flat[outside], _, hessian[outside] = walls.descend(wall)
             x = area.clip(x)
     cost[cost > cost.min(axis=1, keepdims=True) + IMPLAUSIBLE] = np.inf
     return x.reshape(*sets, 3), cost, hessian.reshape(*sets, 3, 3)
@@ -158,12 +156,12 @@ class _Trilateration:
         return replace(self, range_m=self.range_m[rows], mean=mean, information=information)
 
     def descend(
-        self, x: NDArray[np.float64], steps: int = STEPS
+        self, x: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Run Levenberg-Marquardt from n starts; return positions, loss, gradient and Hessian."""
         damping = np.full(len(x), 1e-2)
         cost, gradient, hessian, _ = self.linearised(x)
-        for _ in range(steps):
+        for _ in range(_STEPS):
             diagonal = np.einsum("nii->ni", hessian)
             damped = hessian + (damping[:, None] * diagonal + 1e-9)[:, :, None] * np.eye(3)
             step = np.linalg.solve(damped, gradient[..., None])[..., 0]
