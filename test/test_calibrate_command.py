@@ -493,10 +493,10 @@ def test_reference_of_ranges_does_not_depend_on_what_is_subtracted(monkeypatch):
     estimate, estimated, mae_m = solution_module.self_calibrate, {}, []
 
     def estimate_once(anchors, tags, *given, **options):
-        times = tags[0].stamp_ns.tobytes()
-        if times not in estimated:
-            estimated[times] = estimate(anchors, tags, *given, **options)
-        return estimated[times]
+        key = tags[0].stamp_ns.tobytes() + tags[0].range_m.tobytes()
+        if key not in estimated:
+            estimated[key] = estimate(anchors, tags, *given, **options)
+        return estimated[key]
 
     monkeypatch.setattr(solution_module, "self_calibrate", estimate_once)
     for share in (0.5, 1.0):
@@ -514,7 +514,7 @@ def test_with_cirs_half_of_the_differences_of_true_offsets_is_subtracted():
     site = read_site([records], source.anchors, UNIVERSAL)
     stamp_ns = np.array([record.measurement.stamp_ns for record in records])
     path = TruePath(stamp_ns, np.array([record.tag_position for record in records]))
-    localisation = replace(localisation_of(path), tag_ids=[site.tags[0].tag_id])
+    localisation = replace(poses := localisation_of(path), paths={site.tags[0].tag_id: poses.paths[7]})
     solution = solve_with_truth(site, localisation)
     values = np.array([value for value, _ in solution.pairs.values()])
     assert np.ptp(values) > 0.02

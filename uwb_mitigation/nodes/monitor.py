@@ -155,8 +155,10 @@ class Monitor(Node):
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             name = status.name.removesuffix(diagnostics.NAME_END)
-            if name != status.name and (name in self.reports or len(self.reports) < MAX_REPORTS):
+            if name != status.name:
                 self.reports[name] = time.monotonic(), status.level, status.message
+                if len(self.reports) > MAX_REPORTS:
+                    del self.reports[min(self.reports, key=lambda name: self.reports[name][0])]
 
     def _on_raw(self, data: bytes) -> None:
         with contextlib.suppress(RecordingError):
@@ -212,12 +214,13 @@ def live_table(statistics: RangeStatistics, title: str, width: int = 80) -> Tabl
 def report_lines(reports: dict[str, tuple[float, bytes, str]], now_s: float) -> list[Text]:
     """Return one line for each node: its name and message; `reports`: see `Monitor`, `now_s`: on the steady clock."""
     styles = {diagnostics.OK: "green", diagnostics.WARN: "yellow", diagnostics.ERROR: "red"}
-    return [
-        Text(f"{name}: {text}", style=styles.get(level, ""))
-        if now_s - received_s < STALE_S
-        else Text(f"{name}: no diagnostics for {now_s - received_s:.0f} s", style="yellow")
-        for name, (received_s, level, text) in sorted(reports.copy().items())
-    ]
+    lines = []
+    for name, (received_s, level, text) in sorted(reports.copy().items()):
+        age_s = now_s - received_s
+        silent = f"no diagnostics for {age_s:.0f} s; last: " if age_s > STALE_S else ""
+        style = styles.get(max(level, diagnostics.WARN) if silent else level, "")
+        lines.append(Text(f"{name}: {silent}{text}", style=style))
+    return lines
 
 
 def summary(statistics: RangeStatistics) -> Group:

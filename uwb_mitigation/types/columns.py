@@ -29,7 +29,9 @@ class Columns:
 
     @staticmethod
     def joined(tables: Sequence[_Table]) -> _Table:
-        """Concatenate one or more tables; other fields are those of the first one, whose columns all must have."""
+        """Concatenate one or more tables of the same columns; other fields are those of the first one."""
+        if any(table.columns().keys() != tables[0].columns().keys() for table in tables):
+            raise ValueError("the tables have different columns")
         columns: Any = {
             name: np.concatenate([getattr(table, name) for table in tables]) for name in tables[0].columns()
         }

@@ -23,6 +23,7 @@ from uwb_mitigation.positioning.health import NO_DATA_S
 from uwb_mitigation.positioning.online.measurements import TagHeight, TagRange
 from uwb_mitigation.positioning.online.tag_estimator import TagEstimator
 from uwb_mitigation.positioning.recorded_tracks import TagTracks
+from uwb_mitigation.positioning.residual_directions import ResidualDirections
 from uwb_mitigation.types.anchors import MAX_ANCHORS, Anchor, AnchorMap
 from uwb_mitigation.types.measurement import Cir, Status
 from uwb_mitigation.types.ros.poses import tag_frame
@@ -312,7 +313,7 @@ class Scene:
             return math.nan
         x, y, z = anchor.position
         tag, anchor_place = (pose.x, pose.y, finite_or_zero(pose.z - z)), (x, y, 0.0)
-        self.pairs[pair].directions.add(sample.corrected_m, tag, anchor_place)
+        self.pairs[pair].directions.add(sample.received_s, sample.corrected_m, tag, anchor_place)
         return float(sample.corrected_m) - math.dist(tag, anchor_place)
 
     def _locate_raw(self, pair: Pair, pose: Pose, sample: Sample) -> None:
@@ -345,6 +346,8 @@ class Scene:
             ]
             self._anchor_map = AnchorMap(places)
             self._raw_locators.clear()
+            for _, history, _ in self.latest():
+                history.directions = ResidualDirections()
 
     def set_node_status(self, name: str, report: NodeStatus) -> None:
         report = replace(report, message=report.message[:MAX_TEXT])

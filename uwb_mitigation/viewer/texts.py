@@ -111,6 +111,7 @@ class Texts:
         for pair, history, _ in scene.latest():
             by_tag[pair[1]][pair] = history.directions
         moved = dict(filter(None, map(displaced_anchor, by_tag.values())))
+        moved_tags = {tag_id for _, tag_id in moved}
         for pair, history, sample in scene.latest():
             missing, age_s = scene.no_data(history), scene.age_s(sample)
             means = dict.fromkeys(history.statistics(), math.nan) if missing else history.statistics()
@@ -124,7 +125,7 @@ class Texts:
                 x, y = place.position[:2]
                 moved_m = math.dist((x, y), scene.anchors[pair[0]].position[:2])
                 means |= {"displaced": residual_m, "fit_x": x, "fit_y": y, "moved": moved_m}
-            if displaced:
+            if displaced or pair[1] in moved_tags:
                 # A displaced anchor bends the track with which all are compared.
                 means |= {"residual": math.nan, "evidence": 0.0}
             pairs[pair] = means

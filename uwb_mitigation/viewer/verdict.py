@@ -27,7 +27,7 @@ LOOKS = {
 }
 """Marker and colour of an anchor for each state; statuses of ranges have other markers."""
 STATES = (
-    f"{health.BAD}: ranges stopped, or a mean residual over {health.VERY_LONG_M:.2f} m with line of sight. {health.CHECK}: a mean residual over {health.LONG_M:.2f} "
+    f"{health.BAD}: ranges stopped, probably displaced, or a mean residual over {health.VERY_LONG_M:.2f} m with line of sight. {health.CHECK}: a mean residual over {health.LONG_M:.2f} "
     f"m, {health.MAX_LOST:.0f} % lost, {health.MAX_NOT_OK:.0f} % with a status that needs attention, or {health.MAX_NLOS:.0f} % NLOS. {health.UNKNOWN}: fewer than "
     f"{health.EVIDENCE} ranges can be compared with the position. {health.SILENT}: none so far, or of no anchor. The status "
     "of a pair shows only whether the network could correct the range."

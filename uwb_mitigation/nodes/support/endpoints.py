@@ -174,12 +174,12 @@ def _translate_errors(node: LifecycleNode, topic: str) -> Iterator[None]:
     except (RuntimeError, ValueError, TypeError, AttributeError, AssertionError, ParameterException) as error:
         name = node.resolve_topic_name(topic)
         prefix = f"qos_overrides.{name}."
-        published = node.get_publisher_names_and_types_by_node(node.get_name(), node.get_namespace())
-        if name in dict(published):
-            raise ParameterError(
-                f"this node uses {name} twice", valid="two topics: see the remappings"
-            ) from error
         if not any(given.startswith(prefix) for given in getattr(node, "given_parameters", ())):
+            published = node.get_publisher_names_and_types_by_node(node.get_name(), node.get_namespace())
+            if name in dict(published):
+                raise ParameterError(
+                    f"this node uses {name} twice", valid="two topics: see the remappings"
+                ) from error
             # An error of ROS, which may be transient.
             raise
         raise ParameterError(

@@ -54,7 +54,7 @@ class PositionMonitor:
         if estimate is not None:
             position = estimate.position.tolist()
             residual_m = corrected.range_m - math.dist(position, anchor.position)
-            self._directions[anchor.id].add(corrected.range_m, position, anchor.position)
+            self._directions[anchor.id].add(self._received_s, corrected.range_m, position, anchor.position)
         # The power gap of the CIR, with which the viewer recognises NLOS, is not in corrected ranges.
         status = corrected.status
         is_uncertain = status is Status.OUT_OF_DISTRIBUTION or (
@@ -74,7 +74,7 @@ class PositionMonitor:
             return Verdict(health.UNDETERMINED, reason, remedy and f"Remedy: {remedy}")
         sd_m, anchors = math.sqrt(np.trace(estimate.covariance[:2, :2])), self._means()
         reason, action = statement, remedy and f"Remedy: {remedy}"
-        if current.is_unique or any(means["displaced"] for means in anchors.values()):
+        if current.is_unique:
             states = {key: health.state(means) for key, means in anchors.items()}
             names = {anchor.id: anchor.name for anchor in self._residuals}
             reason, action = health.degradation(anchors, states, names, sd_m)

@@ -131,7 +131,7 @@ class LeastSquares:
         of_knots = csr_matrix((weight, knot, np.arange(rows + 1)), shape=(rows, self.knots)).T
         i, j = np.tril_indices(b)
         self._band.reshape(2 * b, self.knots, b)[i - j, :, j] += (of_knots @ (values[:, i] * values[:, j])).T
-        with_shared = (values[:, :, None] * shared[:, None, :]).reshape(rows, -1)
+        with_shared = (values[:, :, None] * shared[:, None, :]).reshape(rows, b * self.shared)
         self._border[:n] += (of_knots @ with_shared).reshape(n, -1)
         self._border[n:] += (shared.T * weight) @ shared
         self._right[:n] += (of_knots @ (values * target[:, None])).reshape(-1)

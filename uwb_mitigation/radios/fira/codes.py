@@ -69,7 +69,14 @@ EXCHANGE_REMEDIES = {
 UNEXPECTED_CAUSES = ("negative distance", "transmission failed")
 """Causes that do not occur because a board is out of range."""
 
-EXCHANGE_CAUSES = dict(zip((0x1B, *range(0x20, 0x25)), EXCHANGE_REMEDIES, strict=True))
+EXCHANGE_CAUSES = {
+    0x1B: "negative distance",
+    0x20: "transmission failed",
+    0x21: "reception timeout",
+    0x22: "PHY decoding error",
+    0x23: "no time of arrival",
+    0x24: "STS error",
+}
 """{status of a range: cause}."""
 
 
