@@ -412,6 +412,25 @@ def test_anchors_at_wrong_positions_are_named_with_truth_too(located, wrong, nam
         solve_with_truth(site, localisation_of(path))
 
 
+def test_each_tag_has_its_own_lever_arm():
+    arms, records = {9: (0.3, 0.1, 0.0), 7: (-0.4, 0.0, 0.0)}, []
+    for tag_id, arm in arms.items():
+        ranges, path = drive(
+            SITE, seconds=40, rate_hz=10.0, offset_m=0.0, path=lambda t, arm=arm: circuit(t) + arm
+        )
+        records += [
+            replace(record, measurement=replace(record.measurement, tag_id=tag_id))
+            for record in records_of(ranges, *with_errors(ranges, seed=3))
+        ]
+    robot = replace(path, position=path.position - arms[7])
+    poses = localisation_of(robot).paths[7]
+    localisation = Localisation("/odom", dict.fromkeys(arms, poses), 0.0, arms)
+    site = read_site([records], SITE, UNIVERSAL)
+    solution = solve_with_truth(site, localisation, height=Height(1.0))
+    expected = robot.position_at(site.ranges.stamp_ns) + [arms[site.tags[tag].tag_id] for tag in site.tag]
+    assert np.nanmax(np.abs(solution.alignment.position - expected)) < 0.01
+
+
 def test_small_displacement_and_heavy_tail_accuse_no_anchor():
     ranges, path = drive(seconds=160, rate_hz=10.0, offset_m=0.2)
     rng = np.random.default_rng(4)
