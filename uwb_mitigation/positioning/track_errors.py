@@ -62,24 +62,22 @@ _JSON_KEYS = {
     "height_rmse": "height_rmse_m",
 }
 
-
 NO_ERRORS = TrackErrors(0)
 
 
-def track_errors(track: Track, truth: TruePath, offset_ns: int = 0) -> TrackErrors:
+def track_errors(track: Track, truth: TruePath) -> TrackErrors:
     """Return the errors of a track at its own times.
 
     Args:
         track: estimates; NaN covariances are not evaluated.
         truth: true positions.
-        offset_ns: added to the track's stamps to get times of the truth.
     """
-    true = truth.position_at(track.stamp_ns + offset_ns)
+    true = truth.position_at(track.stamp_ns)
     known = np.isfinite(true).all(axis=1)
     if not known.any():
         return NO_ERRORS
     errors = errors_of(track.position[known], track.covariance[known], true[known])
-    of_yaw = np.angle(np.exp(1j * (track.yaw[:, 0] - truth.yaw_at(track.stamp_ns + offset_ns))))
+    of_yaw = np.angle(np.exp(1j * (track.yaw[:, 0] - truth.yaw_at(track.stamp_ns))))
     is_known = np.isfinite(of_yaw)
     of_yaw, yaw_sd = of_yaw[is_known], np.sqrt(track.yaw[is_known, 4])
     if not len(of_yaw):

@@ -23,7 +23,7 @@ JOIN_WINDOW = 32
 
 
 class McapRecording(Source):
-    """The measurements in an MCAP file or a rosbag2 folder; implements `sources.source.Source`.
+    """The measurements in an MCAP file or a rosbag2 folder; implements `types.source.Source`.
 
     Args:
         path: an MCAP file, or a folder with `metadata.yaml` or `*.mcap`.

@@ -65,7 +65,7 @@ class TwrBatch:
 
 
 class Simulated(Source):
-    """Common base of these sources: a `sources.source.Source` over batches of exchanges."""
+    """Common base of these sources: a `types.source.Source` over batches of exchanges."""
 
     simulated = True
 
