@@ -227,8 +227,7 @@ def _head_in_blocks(weight: NDArray[np.int8], shape: Remnet) -> NDArray[np.int8]
     length = shape.lengths[-1]
     blocks = -(-length // _BLOCK)
     padded = np.pad(weight[:, 0].reshape(FILTERS, length), ((0, 0), (0, -length % _BLOCK)))
-    in_words: NDArray[np.int8] = padded.reshape(FILTERS, blocks, _BLOCK)[..., _POSITION_ORDER].swapaxes(0, 1)
-    return in_words
+    return np.asarray(padded.reshape(FILTERS, blocks, _BLOCK)[..., _POSITION_ORDER].swapaxes(0, 1), np.int8)
 
 
 def _head_words(weight: NDArray[np.int8]) -> NDArray[np.int16]:

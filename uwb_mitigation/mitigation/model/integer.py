@@ -75,5 +75,4 @@ class IntegerNetwork:
         flat = values.reshape(len(values), -1).astype(np.int64)
         accumulator = flat @ self.weights.weight[HEAD].astype(np.int64) + self.weights.bias[HEAD]
         factor = self.weights.activation_scale[self._inputs[HEAD][0]] * self.weights.weight_scale[HEAD]
-        output: NDArray[np.float32] = accumulator[:, 0].astype(np.float32) * factor
-        return output
+        return np.asarray(accumulator[:, 0].astype(np.float32) * factor, np.float32)

@@ -110,8 +110,7 @@ class NativeRadio:
     @property
     def address(self) -> int:
         """Address of the radio; 0 until the chip has started."""
-        address: int = self._library.native_radio_address(self._radio)
-        return address
+        return int(self._library.native_radio_address(self._radio))
 
     @property
     def settings(self) -> RadioSettings:
