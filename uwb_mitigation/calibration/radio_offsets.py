@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from itertools import islice
 
@@ -121,7 +121,6 @@ def estimate_offset(
     *,
     tag_id: int | None = None,
     anchor_id: int | None = None,
-    on_record: Callable[[], None] = lambda: None,
 ) -> OffsetEstimate:
     """Estimate the offset of the radios in a recording.
 
@@ -131,7 +130,6 @@ def estimate_offset(
         distance_m: distance of the antennas; None: use the true range of each record.
         tag_id: use only this tag; None: all.
         anchor_id: use only this anchor; None: all.
-        on_record: called for each record that was read.
 
     Raises:
         ParameterError: `distance_m` is given, but there are several pairs.
@@ -141,8 +139,6 @@ def estimate_offset(
     without_truth = 0
     stream = iter(records)
     while batch := list(islice(stream, _BATCH)):
-        for _ in batch:
-            on_record()
         selected = [
             record
             for record in batch

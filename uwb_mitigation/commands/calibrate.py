@@ -189,12 +189,11 @@ def _gather(bags: list[Path], anchors: AnchorMap, source: Bundle, settings: Trac
 
     topic, sd_m = settings.height_topic, settings.height_sd_m
     heights = None if topic is None else [read_heights(bag, topic, sd_m) for bag in bags]
-    with ExitStack() as stack, console.reading() as on_record:
+    with ExitStack() as stack, console.counting() as counted:
         site = read_site(
-            [stack.enter_context(open_recording(bag)) for bag in bags],
+            [counted(stack.enter_context(open_recording(bag))) for bag in bags],
             anchors,
             source,
-            on_record,
             stamp_offset_s=settings.stamp_offset_s,
             heights=heights,
         )

@@ -25,9 +25,6 @@ if TYPE_CHECKING:
 
 app = typer.Typer(help="Import, simulate and show recordings.", no_args_is_help=True)
 
-_STRIDE = 100
-"""Number of ranges between two updates of a progress bar."""
-
 _LONGEST_PAUSE_S = 5.0
 
 CirOption = Annotated[
@@ -189,19 +186,15 @@ def _copy(
 
     damage: list[DamagedRecordingError] = []
     robot, row = _motion_of(sources[0], pauses.start_ns or 0), 0
-    with console.progress() as bar:
-        task = bar.add_task("writing", total=total)
+    with console.counting("writing", total) as counted:
         for source in sources:
             pauses.is_new_source = True
             try:
                 with source:
-                    for record in summary.watch(source):
-                        record = pauses.without(record)
+                    for record in map(pauses.without, counted(summary.watch(source))):
                         if robot is not None:
                             row = write_robot(bag, *robot, row, record.measurement.stamp_ns)
                         bag.write(record)
-                        if (count := summary.ranges) % _STRIDE == 0:
-                            bar.update(task, completed=count, description=f"writing: {count} ranges")
             except DamagedRecordingError as error:
                 damage.append(error)
     return damage[0] if damage else None
@@ -266,9 +259,9 @@ def info(
     source = _open(path, cir)
     summary = RecordingSummary()
     try:
-        with source, console.reading() as on_record:
-            for _ in summary.watch(source):
-                on_record()
+        with source, console.counting() as counted:
+            for _ in counted(summary.watch(source)):
+                pass
     finally:
         # Show the readable part before an error of the rest is raised.
         result = summary.as_json()

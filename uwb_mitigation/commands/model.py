@@ -170,8 +170,8 @@ def quantise(
     source = load_bundle(model)
     quantisation.check(source)
     options.check_output(output, force)
-    with console.reading() as on_record:
-        dataset = recordings.load_inputs(data, source.card.preprocessing, on_record)
+    with console.counting() as counted:
+        dataset = recordings.load_inputs(data, source.card.preprocessing, counted)
     console.show_skipped(dataset.skipped)
     bundle, difference = quantisation.quantise_bundle(source, dataset, output)
     model_tables.show_bundle(bundle)
@@ -238,8 +238,8 @@ def evaluate(
     from uwb_mitigation.types.offsets import read_offsets
 
     mitigation = Mitigation(load_model(model), read_offsets(offsets or ""))
-    with open_recording(data) as source, console.reading() as on_record:
-        result = accuracy.evaluate_accuracy(mitigation, source, on_record)
+    with open_recording(data) as source, console.counting() as counted:
+        result = accuracy.evaluate_accuracy(mitigation, counted(source))
     model_tables.show_accuracy(result)
     if len(mitigation.used) > 1:
         show_models(mitigation.used)
@@ -268,7 +268,7 @@ def _dataset(data: Path, preprocessing: Preprocessing, truth: Sequence[Path] = (
     """Return name and measurements of a recording; print the number of skipped ranges by reason."""
     from uwb_mitigation.training.data import recordings
 
-    with console.reading() as on_record:
-        name, dataset = recordings.load_dataset(data, preprocessing, truth, on_record)
+    with console.counting() as counted:
+        name, dataset = recordings.load_dataset(data, preprocessing, truth, counted)
     console.show_skipped(dataset.skipped)
     return name, dataset

@@ -74,14 +74,9 @@ def offset(
         _id(name, text) if text is not None else None for name, text in (("anchor", anchor), ("tag", tag))
     )
     mitigation = Mitigation(bundle_for(model, bag))
-    with open_recording(bag) as source, console.reading() as on_record:
+    with open_recording(bag) as source, console.counting() as counted:
         estimate = radio_offsets.estimate_offset(
-            mitigation,
-            source,
-            distance,
-            tag_id=tag_id,
-            anchor_id=anchor_id,
-            on_record=on_record,
+            mitigation, counted(source), distance, tag_id=tag_id, anchor_id=anchor_id
         )
     _show(estimate)
     if output is not None:

@@ -35,11 +35,10 @@ from uwb_mitigation.radios.settings import (
     settings_text,
     status_warning,
 )
-from uwb_mitigation.radios.wire import events
-from uwb_mitigation.radios.wire.events import Event, LinkState, Loss
+from uwb_mitigation.radios.wire import session as sessions
 from uwb_mitigation.radios.wire.layout import LogLevel, Mode
 from uwb_mitigation.radios.wire.messages import BoardStatus, Correction, Hello, Log, RadioConfigured
-from uwb_mitigation.radios.wire.session import BoardSession
+from uwb_mitigation.radios.wire.session import BoardSession, Event, LinkState, Loss, Refused
 from uwb_mitigation.types.measurement import RangeMeasurement
 from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets, read_offsets
 
@@ -118,11 +117,11 @@ class BoardPort(StreamPort):
         with self._lock:
             before, self._board = self._board, settings
             if settings.radio != before.radio:
-                self._refused.pop(events.RADIO_PROBLEM, None)
+                self._refused.pop(sessions.RADIO_PROBLEM, None)
                 self.session.set_radio(settings.radio or DEFAULT_RADIO)
             has_new_offsets = (settings.mode, settings.offsets) != (before.mode, before.offsets)
             if settings.mode is Mode.DEVICE and has_new_offsets:
-                self._refused.pop(events.OFFSETS_PROBLEM, None)
+                self._refused.pop(sessions.OFFSETS_PROBLEM, None)
                 self.session.set_offsets(settings.offsets)
             if settings.mode is not None and settings.mode != before.mode:
                 self.session.set_mode(settings.mode)
@@ -214,7 +213,7 @@ class BoardPort(StreamPort):
                 if settings != self._radio:
                     text = f"the board's radio {format_id(settings.address)}: {settings_text(settings)}"
                 self._radio = settings
-            case events.Refused(problem=problem, text=reason):
+            case Refused(problem=problem, text=reason):
                 self._refused[problem] = reason
                 level, text = logging.ERROR, f"{problem}: {reason}"
             case Hello():
