@@ -6,12 +6,10 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from uwb_mitigation.commands.support import console, options
 from uwb_mitigation.commands.support.bundles import show_models
 from uwb_mitigation.commands.support.console import JsonOption, print_line, show_table, warn
-from uwb_mitigation.commands.support.options import check_replaceable, output_option
+from uwb_mitigation.commands.support.options import argument, check_replaceable, option, output_option
 from uwb_mitigation.errors import ParameterError, check_name, format_id
 
 if TYPE_CHECKING:
@@ -44,9 +42,7 @@ TRACK_COLUMNS = {
     "epochs": "epochs:d",
 }
 
-BagArgument = Annotated[
-    Path, typer.Argument(metavar="BAG", help="An MCAP bag with ranges, corrected or raw.")
-]
+BagArgument = Annotated[Path, argument("BAG", "An MCAP bag with ranges, corrected or raw.")]
 
 
 @options.with_settings()
@@ -56,17 +52,15 @@ def track(
     settings: TrackSettings,
     anchors: options.AnchorsOption = None,
     tum: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Also write the smoothed track in TUM's format, as evo reads it."),
+        Path | None, option("Also write the smoothed track in TUM's format, as evo reads it.", metavar="FILE")
     ] = None,
     report: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Also write an HTML page: verdict, map, errors over time."),
+        Path | None, option("Also write an HTML page: verdict, map, errors over time.", metavar="FILE")
     ] = None,
     png: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Also draw a map of the tracks (needs matplotlib).")
+        Path | None, option("Also draw a map of the tracks (needs matplotlib).", metavar="FILE")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace what exists.")] = False,
+    force: Annotated[bool, option("Replace what exists.", "--force")] = False,
     json: JsonOption = None,
 ) -> None:
     """Estimate the tracks of a recording's tags: filtered and smoothed.
@@ -139,14 +133,12 @@ def survey(
     output: Annotated[Path, output_option("FILE", "The anchors file to write.")],
     settings: TrackSettings,
     anchors: options.AnchorsOption = None,
-    off: Annotated[
-        float, typer.Option(help="Standard deviation of the guesses in FILE, m in each coordinate.")
-    ] = 1.0,
+    off: Annotated[float, option("Standard deviation of the guesses in FILE, m in each coordinate.")] = 1.0,
     fixed: Annotated[
         list[str] | None,
-        typer.Option("--fixed", metavar="ID", help="An anchor that is where FILE says; may be repeated."),
+        option("An anchor that is where FILE says; may be repeated.", "--fixed", metavar="ID"),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace FILE if it exists.")] = False,
+    force: Annotated[bool, option("Replace FILE if it exists.", "--force")] = False,
     json: JsonOption = None,
 ) -> None:
     """Estimate anchor positions from rough guesses and a drive past them.
