@@ -15,6 +15,7 @@ from typing import Any
 
 from uwb_mitigation.errors import LinkError, ParameterError, RecordingError
 from uwb_mitigation.radios.capture import Capture, Session
+from uwb_mitigation.radios.parameters import ValueReader, read_baud, read_capture, read_ports
 from uwb_mitigation.radios.port import (
     ExchangeMonitor,
     PortAddress,
@@ -24,7 +25,7 @@ from uwb_mitigation.radios.port import (
     StreamSettings,
     stream_opener,
 )
-from uwb_mitigation.radios.settings import PortMessage, ValueReader, read_baud, read_capture, read_ports
+from uwb_mitigation.radios.settings import PortMessage
 from uwb_mitigation.recordings.live_ranges import LiveConverter
 from uwb_mitigation.recordings.mapping.conversion import UNREADABLE
 from uwb_mitigation.recordings.mapping.mapping import Mapping, StartDialogue, load_mapping

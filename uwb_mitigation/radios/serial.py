@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from uwb_mitigation.errors import LinkError, ParameterError, format_id
+from uwb_mitigation.radios.parameters import ValueReader, read_baud, read_radio
 from uwb_mitigation.radios.port import (
     ExchangeMonitor,
     PortAddress,
@@ -20,21 +21,7 @@ from uwb_mitigation.radios.port import (
     processes_using,
     stream_opener,
 )
-from uwb_mitigation.radios.settings import (
-    DEFAULT_RADIO,
-    EXCHANGE_REMEDIES,
-    STATE_PROBLEMS,
-    PortMessage,
-    RadioSettings,
-    RadioStatus,
-    Role,
-    ValueReader,
-    radio_values,
-    read_baud,
-    read_radio,
-    settings_text,
-    status_warning,
-)
+from uwb_mitigation.radios.settings import DEFAULT_RADIO, PortMessage, RadioSettings, RadioStatus, Role
 from uwb_mitigation.radios.wire import session as sessions
 from uwb_mitigation.radios.wire.layout import LogLevel, Mode
 from uwb_mitigation.radios.wire.messages import BoardStatus, Correction, Hello, Log, RadioConfigured
@@ -98,7 +85,7 @@ class BoardPort(StreamPort):
 
     def __init__(self, settings: SerialSettings, place: StreamPlace) -> None:
         session = BoardSession(mode=settings.mode, expected_model_id=settings.model_id)
-        super().__init__(settings, session, ExchangeMonitor(EXCHANGE_REMEDIES), place)
+        super().__init__(settings, session, ExchangeMonitor(RadioStatus.REMEDIES), place)
         self._board = settings
         self._connections = 0
         self._other_users = ""
@@ -168,9 +155,9 @@ class BoardPort(StreamPort):
             if radio is not None:
                 hardware += f", radio {format_id(radio.address)}"
             if status is not None:
-                values |= radio_values(radio, status, "radio: ")
-                problems.append(STATE_PROBLEMS.get(status.state, ""))
-                warning = status_warning(status)
+                values |= status.values(radio, "radio: ")
+                problems.append(status.problem)
+                warning = status.warning
             if radio is None or radio.role is Role.TAG or radio.report:
                 exchanges = self.monitor.warning(radio.interval_us / 1e6 if radio is not None else 0.0)
                 warning = warning or (f"connected; {exchanges}" if exchanges else "")
@@ -211,7 +198,7 @@ class BoardPort(StreamPort):
             case RadioConfigured(settings=settings):
                 # A board may repeat its settings.
                 if settings != self._radio:
-                    text = f"the board's radio {format_id(settings.address)}: {settings_text(settings)}"
+                    text = f"the board's radio {format_id(settings.address)}: {settings.text}"
                 self._radio = settings
             case Refused(problem=problem, text=reason):
                 self._refused[problem] = reason
