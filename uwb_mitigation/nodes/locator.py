@@ -131,10 +131,8 @@ class Locator(ManagedNode):
         self._period_ns = round(NS_PER_S / self.value("rate")) if self.value("rate") > 0 else 0
         self._offset_ns = round(self.value("stamp_offset") * NS_PER_S)
         self._map, self._plain_frame = self.value("map_frame"), self.value("tag_frame")
-        if (
-            poses.tag_of_frame(self._plain_frame) not in (None, self.value("tag"))
-            or self._plain_frame == self._map
-        ):
+        frame_tag = poses.tag_of_frame(self._plain_frame)
+        if frame_tag not in (None, self.value("tag")) or self._plain_frame == self._map:
             raise ParameterError(
                 f"parameter tag_frame = {self._plain_frame!r} is the frame of another tag or of the map",
                 valid="a name of its own, such as uwb_tag",
