@@ -16,10 +16,9 @@ from hypothesis import strategies as st
 from benchmarks.decoder import loopback
 from benchmarks.equipment.faults import Faults
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.radios.wire.events import LinkState
 from uwb_mitigation.radios.wire.framing import FrameDecoder, WireFrame, encode_frame
 from uwb_mitigation.radios.wire.layout import MAX_PAYLOAD_BYTES, MessageType, Mode
-from uwb_mitigation.radios.wire.session import BoardSession
+from uwb_mitigation.radios.wire.session import BoardSession, LinkState
 
 A = WireFrame(MessageType.LOG, 0, 7, 123_456, b"first\0\0")
 

@@ -10,11 +10,10 @@ import pytest
 from benchmarks.equipment.board import Board
 from uwb_mitigation.radios.settings import PortMessage, RadioSettings
 from uwb_mitigation.radios.wire import messages
-from uwb_mitigation.radios.wire.events import Event, LinkState, Loss, Refused
 from uwb_mitigation.radios.wire.framing import FrameDecoder, FrameEncoder, WireFrame
 from uwb_mitigation.radios.wire.layout import MAX_OFFSETS, Flag, LogLevel, MessageType, Mode
 from uwb_mitigation.radios.wire.messages import BoardStatus, Correction, Hello, Log
-from uwb_mitigation.radios.wire.session import BoardSession
+from uwb_mitigation.radios.wire.session import BoardSession, Event, LinkState, Loss, Refused
 from uwb_mitigation.types.measurement import Cir, CorrectedBy, CorrectedRange, RangeMeasurement, Status
 from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets
 

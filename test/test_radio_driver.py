@@ -17,13 +17,12 @@ from uwb_mitigation_msgs.msg import Cir, RangeCir
 from benchmarks.equipment.dw1000_model.evb1000 import EmulatedEvb1000s
 from benchmarks.equipment.emulated_board import EmulatedBoard
 from uwb_mitigation.errors import format_id
+from uwb_mitigation.radios.parameters import read_radio
 from uwb_mitigation.radios.settings import (
     AGE_UNKNOWN_MS,
     AnchorStatus,
     RadioSettings,
     RadioStatus,
-    radio_values,
-    read_radio,
 )
 from uwb_mitigation.simulation.simulated import SimulatedSource
 
@@ -73,7 +72,7 @@ def test_address_is_read_as_it_is_printed(address: int):
 
 def test_anchor_that_never_answered_has_no_last_seen_time():
     anchors = AnchorStatus(7, 9, 0, np.nan, AGE_UNKNOWN_MS), AnchorStatus(8, 9, 9, -80.0, 1500)
-    never, recent = [*radio_values(None, RadioStatus(anchors=anchors)).values()][-2:]
+    never, recent = [*RadioStatus(anchors=anchors).values(None).values()][-2:]
     assert never == "0 of 9 ranged, nan dBm, last seen never"
     assert recent == "9 of 9 ranged, -80.0 dBm, last seen 1.5 s ago"
 

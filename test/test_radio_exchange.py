@@ -18,8 +18,7 @@ from uwb_mitigation.radios.port import PortAddress
 from uwb_mitigation.radios.serial import BoardPort, SerialSettings
 from uwb_mitigation.radios.settings import PREAMBLES, PortMessage, RadioSettings, Role
 from uwb_mitigation.radios.wire import messages
-from uwb_mitigation.radios.wire.events import Refused
-from uwb_mitigation.radios.wire.session import BoardSession
+from uwb_mitigation.radios.wire.session import BoardSession, Refused
 from uwb_mitigation.types.measurement import RangeMeasurement
 
 pytestmark = NEEDS_CC

@@ -15,7 +15,7 @@ from benchmarks.equipment.dw1000_model.air import Air, Chip, Host
 from benchmarks.equipment.dw1000_model.pairs import Pair
 from uwb_mitigation.errors import LinkError
 from uwb_mitigation.radios.dw1000.native import Io, NativeRadio, load_native
-from uwb_mitigation.radios.settings import RadioSettings, RadioState, RadioStatus, Role, status_warning
+from uwb_mitigation.radios.settings import RadioSettings, RadioState, RadioStatus, Role
 from uwb_mitigation.radios.wire import messages
 from uwb_mitigation.types.measurement import RangeMeasurement
 
@@ -247,7 +247,7 @@ def test_unreported_pll_lock_is_a_warning(air: Air):
     assert len(run.ranges) > 10
     for status in run.statuses:
         assert status.state is RadioState.LOCK_UNCONFIRMED
-        assert "PLL" in status_warning(status)
+        assert "PLL" in status.warning
 
 
 def test_unlocked_clock_is_an_error(air: Air):

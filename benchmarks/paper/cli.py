@@ -166,9 +166,9 @@ def report(
     trainings = None if models is None else results.read(results.ExperimentResults, models / results.RESULTS)
     bench = () if firmware is None else results.read(results.FirmwareResults, firmware).rows
     _make_folder(output)
-    with console.reading() as on_record:
+    with console.counting() as counted:
         longest = Preprocessing(max(published.WINDOWS), Scaling.MAX)
-        study = reports.Study(data, *load_paper_data(data, longest, on_record), _command())
+        study = reports.Study(data, *load_paper_data(data, longest, counted), _command())
     result = reports.build_report(study, trainings, bench)
     page = output / "report.html"
     write_atomically(page, result.html())
@@ -192,8 +192,8 @@ def _split_data(path: Path, samples: int) -> Parts:
     from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
 
     preprocessing = Preprocessing(samples, Scaling.MAX)
-    with console.reading() as on_record:
-        name, _, dataset = paper_data.load_paper_data(path, preprocessing, on_record)
+    with console.counting() as counted:
+        name, _, dataset = paper_data.load_paper_data(path, preprocessing, counted)
     console.show_skipped(dataset.skipped)
     return paper_data.split_dataset(name, dataset)
 

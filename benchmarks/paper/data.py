@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from uwb_mitigation.recordings.formats import open_recording
 from uwb_mitigation.training.data import splits
 from uwb_mitigation.training.data.dataset import Dataset, build_dataset
 from uwb_mitigation.training.data.deepuwb import DeepUwbRecording
+from uwb_mitigation.training.data.recordings import Counted
 
 TRAINING_ROOMS, TEST_ROOM = (1, 3), 2
 """Rooms of the paper's split: 36,023 training and 13,210 test rows."""
@@ -40,7 +40,7 @@ class Parts:
 
 
 def load_paper_data(
-    path: Path, preprocessing: Preprocessing, on_record: Callable[[], None] = lambda: None
+    path: Path, preprocessing: Preprocessing, counted: Counted = iter
 ) -> tuple[str, bool, Dataset]:
     """Return the recording's name, whether it is simulated, and its labelled measurements.
 
@@ -48,7 +48,7 @@ def load_paper_data(
         RecordingError, DatasetError: it cannot be read, or no measurement is usable.
     """
     with (DeepUwbRecording if path.suffix == ".pkl" else open_recording)(path) as source:
-        dataset = build_dataset(source, preprocessing, on_record)
+        dataset = build_dataset(counted(source), preprocessing)
         name, simulated = path.resolve().name, bool(source.simulated)
     return (f"{name} (simulated)" if simulated and "simulated" not in name else name), simulated, dataset
 

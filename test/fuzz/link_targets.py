@@ -7,10 +7,9 @@ from __future__ import annotations
 
 from benchmarks.equipment.board import Board
 from uwb_mitigation.radios.wire import messages
-from uwb_mitigation.radios.wire.events import LinkState
 from uwb_mitigation.radios.wire.framing import FrameDecoder, WireFrame, encode_frame
 from uwb_mitigation.radios.wire.layout import MAX_ENCODED_BYTES, MAX_PAYLOAD_BYTES, Mode
-from uwb_mitigation.radios.wire.session import BoardSession
+from uwb_mitigation.radios.wire.session import BoardSession, LinkState
 
 EPOCH = 1_760_000_000 * 10**9
 

@@ -269,8 +269,7 @@ class _Misfit:
             method="Nelder-Mead",
             options={"initial_simplex": start, "xatol": 0.01, "fatol": 0.01},
         )
-        refined: NDArray[np.float64] = position + np.append(solution.x, 0.0)
-        return refined
+        return np.asarray(position + np.append(solution.x, 0.0), np.float64)
 
 
 def check_anchors(segments: Segments, fit: JointFit, antenna: NDArray[np.float64]) -> None:

@@ -164,8 +164,7 @@ def _independent_share(anchor: NDArray[np.intp], seconds: float, persistence_s: 
     """Return the share of an independent range: a Gauss-Markov process has one per two time constants."""
     _, slot, count = np.unique(anchor, return_inverse=True, return_counts=True)
     independent = np.maximum(seconds / (2.0 * persistence_s), 1.0)
-    independent_share: NDArray[np.float64] = np.minimum(1.0, independent / count)[slot]
-    return independent_share
+    return np.asarray(np.minimum(1.0, independent / count)[slot], np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -276,8 +275,7 @@ def _gap_s(observations: Observations, received: NDArray[np.bool_]) -> NDArray[n
     time_s = observations.time_s + observations.knot_segment * apart_s
     received_s = np.concatenate([[-np.inf], time_s[received], [np.inf]])
     after = np.searchsorted(received_s, time_s)
-    gap_s: NDArray[np.float64] = np.minimum(time_s - received_s[after - 1], received_s[after] - time_s)
-    return gap_s
+    return np.asarray(np.minimum(time_s - received_s[after - 1], received_s[after] - time_s), np.float64)
 
 
 def fit_segments(config: EstimatorConfig, segments: Segments, prior: Regressors, start: Start) -> JointFit:
@@ -401,8 +399,7 @@ class _JointProblem:
         )
         summed = np.zeros((int(slot.max(initial=0)) + 1, observations.rows.shape[1]))
         np.add.at(summed, slot.reshape(-1), gain)
-        covariance: NDArray[np.float64] = SD_INFLATION**2 * solution.shared_covariance + summed.T @ summed
-        return covariance
+        return np.asarray(SD_INFLATION**2 * solution.shared_covariance + summed.T @ summed, np.float64)
 
     def _residuals(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return unit vectors (n, 3) from anchors to tags, and residuals (n,)."""

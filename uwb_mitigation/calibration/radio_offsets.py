@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
-from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +28,7 @@ from uwb_mitigation.types.measurement import (
     Record,
     Segment,
     Status,
+    Truth,
 )
 from uwb_mitigation.types.offsets import MAX_OFFSET_M, Offsets
 
@@ -41,7 +41,6 @@ MAX_EXCESS_M, MAX_ERROR_M = 0.15, 0.5
 predicts less for 89 % of the LOS ranges whose power gap is small. The second limit is for models with a linear bias that contains the offset."""
 
 MIN_RANGES = 10
-_BATCH = 256
 _MEDIAN_SD_FACTOR = math.sqrt(math.pi / 2.0)
 
 _Sample = tuple[float, float, float, float, float, str]
@@ -121,7 +120,6 @@ def estimate_offset(
     *,
     tag_id: int | None = None,
     anchor_id: int | None = None,
-    on_record: Callable[[], None] = lambda: None,
 ) -> OffsetEstimate:
     """Estimate the offset of the radios in a recording.
 
@@ -131,7 +129,6 @@ def estimate_offset(
         distance_m: distance of the antennas; None: use the true range of each record.
         tag_id: use only this tag; None: all.
         anchor_id: use only this anchor; None: all.
-        on_record: called for each record that was read.
 
     Raises:
         ParameterError: `distance_m` is given, but there are several pairs.
@@ -139,34 +136,26 @@ def estimate_offset(
     """
     groups: dict[tuple[int, int, str], list[_Sample]] = {}
     without_truth = 0
-    stream = iter(records)
-    while batch := list(islice(stream, _BATCH)):
-        for _ in batch:
-            on_record()
-        selected = [
-            record
-            for record in batch
-            if tag_id in (None, record.measurement.tag_id)
-            and anchor_id in (None, record.measurement.anchor_id)
-        ]
-        results = mitigation.correct([record.measurement for record in selected])
-        for record, result in zip(selected, results, strict=True):
-            measured, truth = record.measurement, record.truth if distance_m is None else None
-            true_m = distance_m if distance_m is not None else math.nan if truth is None else truth.range_m
-            if not math.isfinite(true_m):
-                without_truth += 1
-                continue
-            placement = "" if truth is None else truth.configuration
-            predicted_m = _predicted_m(mitigation, measured, result)
-            model = mitigation.bundles[mitigation.choose(CirKind.of(measured.cir)).model]
-            gap_db = _power_gap_db(measured, Preprocessing(model.card.preprocessing.samples, Scaling.MAX))
-            has_preamble_cir = len(measured.cir) > 0 and measured.cir.segment is not Segment.STS
-            label = None if has_preamble_cir else "" if truth is None else truth.label
-            is_los = _is_los(gap_db, label)
-            offset_m = measured.range_m - predicted_m - true_m
-            level_dbm = measured.cir.first_path_power_dbm
-            sample = offset_m, predicted_m, gap_db, level_dbm, is_los, result.status.name
-            groups.setdefault((measured.tag_id, measured.anchor_id, placement), []).append(sample)
+    selected = (
+        record
+        for record in records
+        if tag_id in (None, record.measurement.tag_id) and anchor_id in (None, record.measurement.anchor_id)
+    )
+    for record, result in mitigation.correct_records(selected):
+        measured = record.measurement
+        truth = Truth(distance_m) if distance_m is not None else record.truth or Truth(math.nan)
+        if not math.isfinite(truth.range_m):
+            without_truth += 1
+            continue
+        predicted_m = _predicted_m(mitigation, measured, result)
+        model = mitigation.bundles[mitigation.choose(CirKind.of(measured.cir)).model]
+        gap_db = _power_gap_db(measured, Preprocessing(model.card.preprocessing.samples, Scaling.MAX))
+        has_preamble_cir = len(measured.cir) > 0 and measured.cir.segment is not Segment.STS
+        is_los = _is_los(gap_db, None if has_preamble_cir else truth.label)
+        offset_m = measured.range_m - predicted_m - truth.range_m
+        level_dbm = measured.cir.first_path_power_dbm
+        sample = offset_m, predicted_m, gap_db, level_dbm, is_los, result.status.name
+        groups.setdefault((measured.tag_id, measured.anchor_id, truth.configuration), []).append(sample)
     pairs = sorted({(tag, anchor) for tag, anchor, _ in groups})
     _check_pairs(pairs, without_truth, has_one_distance=distance_m is not None)
     includes_offset = any(bundle.card.linear_bias != LinearBiasModel(0.0) for bundle in mitigation.bundles)

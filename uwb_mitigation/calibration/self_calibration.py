@@ -70,8 +70,7 @@ class SelfCalibration:
     def distance_m(self) -> NDArray[np.float64]:
         """The distance of each range's anchor from the track of the other anchors, float64 (r,); NaN: unknown."""
         anchor = self.fit.config.anchors.position[self.segments.ranges.anchor]
-        distance_m: NDArray[np.float64] = np.linalg.norm(self.antenna - anchor, axis=1)
-        return distance_m
+        return np.asarray(np.linalg.norm(self.antenna - anchor, axis=1), np.float64)
 
     def pairs(self) -> list[tuple[int, int]]:
         """Return (tag number, anchor row) of all pairs with ranges."""

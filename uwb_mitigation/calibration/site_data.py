@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -149,7 +149,6 @@ def read_site(
     recordings: Iterable[Iterable[Record]],
     anchors: AnchorMap,
     universal: Bundle,
-    on_record: Callable[[], None] = lambda: None,
     *,
     stamp_offset_s: float = 0.0,
     heights: Sequence[Heights] | None = None,
@@ -161,7 +160,6 @@ def read_site(
         anchors: anchors of the site; other anchors are skipped.
         universal: bundle that the models of the site start from. CIRs that it was not trained for are not used, but their levels
             are.
-        on_record: called for each record that was read.
         stamp_offset_s: time offset added to the stamps of ranges: -0.2 if they are 0.2 s late.
         heights: heights of the tags for each recording. Ranges without a height are excluded.
 
@@ -174,7 +172,6 @@ def read_site(
         shift_ns: int | None = None
         end_ns = table.last_stamp_ns
         for record in recording:
-            on_record()
             stamp_ns = record.measurement.stamp_ns + round(stamp_offset_s * NS_PER_S)
             if shift_ns is None:
                 shift_ns = end_ns - stamp_ns + RECORDING_GAP_NS if stamp_ns <= end_ns else 0

@@ -10,12 +10,10 @@ import typer
 
 from uwb_mitigation.commands.support import console
 from uwb_mitigation.commands.support.console import JsonOption, print_line
-from uwb_mitigation.commands.support.options import check_output, output_option
+from uwb_mitigation.commands.support.options import check_output, option, output_option
 from uwb_mitigation.errors import ModelError
 
-ModelOption = Annotated[
-    Path | None, typer.Option(help="Int8 bundle. Default: the shipped one.", show_default=False)
-]
+ModelOption = Annotated[Path | None, option("Int8 bundle. Default: the shipped one.", show_default=False)]
 
 app = typer.Typer(help="Build firmware.", no_args_is_help=True)
 

@@ -9,11 +9,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from uwb_mitigation.commands.support import console, options
 from uwb_mitigation.commands.support.console import JsonOption, print_line, show_table, warn
-from uwb_mitigation.commands.support.options import check_output, check_replaceable, output_option
+from uwb_mitigation.commands.support.options import argument, option, output_option
 from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError, format_id
 
 if TYPE_CHECKING:
@@ -33,9 +31,9 @@ BASE_FRAME = "base_link"
 def calibrate(
     bags: Annotated[
         list[Path],
-        typer.Argument(
-            metavar="BAG...",
-            help="Recordings of drives past the anchors: bags, or other formats that `data import` reads.",
+        argument(
+            "BAG...",
+            "Recordings of drives past the anchors: bags, or other formats that `data import` reads.",
         ),
     ],
     output: Annotated[
@@ -45,54 +43,48 @@ def calibrate(
     anchors: options.AnchorsOption = None,
     truth_topic: Annotated[
         str | None,
-        typer.Option(
-            metavar="TOPIC",
-            help="Topic of the robot's localisation, used as ground truth: nav_msgs/Odometry, geometry_msgs/PoseStamped or "
+        option(
+            "Topic of the robot's localisation, used as ground truth: nav_msgs/Odometry, geometry_msgs/PoseStamped or "
             "PoseWithCovarianceStamped, or /tf.",
+            metavar="TOPIC",
         ),
     ] = None,
     frames: Annotated[
         tuple[str, str] | None,
-        typer.Option(
-            metavar="MAP BASE", help="With --truth-topic /tf: frame of the anchors and frame of the robot."
-        ),
+        option("With --truth-topic /tf: frame of the anchors and frame of the robot.", metavar="MAP BASE"),
     ] = None,
     time_offset: Annotated[
         float | None,
-        typer.Option(
-            help="With --truth-topic: time offset added to the stamps of the ranges, s. Default: estimated."
-        ),
+        option("With --truth-topic: time offset added to the stamps of the ranges, s. Default: estimated."),
     ] = None,
     lever_arm: Annotated[
         str | None,
-        typer.Option(
-            metavar="X,Y,Z",
-            help="With --truth-topic: position of the antenna in the robot's frame, m. Default: the transform in the bag "
+        option(
+            "With --truth-topic: position of the antenna in the robot's frame, m. Default: the transform in the bag "
             "to the frame_id of the ranges, otherwise 0.",
+            metavar="X,Y,Z",
         ),
     ] = None,
     estimate_lever_arm: Annotated[
         bool,
-        typer.Option(
+        option(
+            "With --truth-topic: estimate the lever arm, starting from the given one. Needs a drive with turns.",
             "--estimate-lever-arm",
-            help="With --truth-topic: estimate the lever arm, starting from the given one. Needs a drive with turns.",
         ),
     ] = False,
     check: Annotated[
         list[Path] | None,
-        typer.Option(
+        option(
+            "Recording of another drive at the same site, on which the calibration is only tested; may be repeated.",
             metavar="BAG",
-            help="Recording of another drive at the same site, on which the calibration is only tested; may be repeated.",
         ),
     ] = None,
     report: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Also write an HTML page with the results.")
+        Path | None, option("Also write an HTML page with the results.", metavar="FILE")
     ] = None,
     force: Annotated[
         bool,
-        typer.Option(
-            "--force", help="Replace existing files, and write a calibration that does not reduce the errors."
-        ),
+        option("Replace existing files, and write a calibration that does not reduce the errors.", "--force"),
     ] = False,
     json: JsonOption = None,
 ) -> None:
@@ -112,8 +104,8 @@ def calibrate(
     from uwb_mitigation.positioning.track_settings import MAX_STAMP_OFFSET_S
     from uwb_mitigation.recordings.bag.anchor_markers import read_anchors
 
-    check_output(output)
-    check_replaceable((output, offsets_file(output), *([report] if report else [])), force)
+    options.check_output(output)
+    options.check_replaceable((output, offsets_file(output), *([report] if report else [])), force)
     given_arm_m = parse_lever_arm(lever_arm)
     truth_options = frames, time_offset, given_arm_m, estimate_lever_arm or None
     if truth_topic is None and any(option is not None for option in truth_options):
@@ -189,12 +181,11 @@ def _gather(bags: list[Path], anchors: AnchorMap, source: Bundle, settings: Trac
 
     topic, sd_m = settings.height_topic, settings.height_sd_m
     heights = None if topic is None else [read_heights(bag, topic, sd_m) for bag in bags]
-    with ExitStack() as stack, console.reading() as on_record:
+    with ExitStack() as stack, console.counting() as counted:
         site = read_site(
-            [stack.enter_context(open_recording(bag)) for bag in bags],
+            [counted(stack.enter_context(open_recording(bag))) for bag in bags],
             anchors,
             source,
-            on_record,
             stamp_offset_s=settings.stamp_offset_s,
             heights=heights,
         )

@@ -13,7 +13,7 @@ import typer
 
 from uwb_mitigation.commands.support import console
 from uwb_mitigation.commands.support.console import JsonOption, print_line, show_table
-from uwb_mitigation.commands.support.options import output_option
+from uwb_mitigation.commands.support.options import argument, option, output_option
 from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError, check_name
 from uwb_mitigation.types.stamps import NS_PER_S
 
@@ -25,33 +25,26 @@ if TYPE_CHECKING:
 
 app = typer.Typer(help="Import, simulate and show recordings.", no_args_is_help=True)
 
-_STRIDE = 100
-"""Number of ranges between two updates of a progress bar."""
-
 _LONGEST_PAUSE_S = 5.0
 
-CirOption = Annotated[
-    Literal["final", "poll"], typer.Option(help="Frame of a DecaRanging exchange whose CIR is used.")
-]
+CirOption = Annotated[Literal["final", "poll"], option("Frame of a DecaRanging exchange whose CIR is used.")]
 OUTPUT = output_option("OUT", "OUT.mcap for one file, any other name for a bag folder.")
-ForceOption = Annotated[bool, typer.Option("--force", help="Replace OUT if it exists.")]
+ForceOption = Annotated[bool, option("Replace OUT if it exists.", "--force")]
 
 
 @app.command("import")
 def import_recordings(
-    sources: Annotated[list[Path], typer.Argument(metavar="SRC...", help="Recordings: logs, folders, bags.")],
+    sources: Annotated[list[Path], argument("SRC...", "Recordings: logs, folders, bags.")],
     output: Annotated[Path | None, OUTPUT] = None,
     mapping: Annotated[
-        str,
-        typer.Option("--map", metavar="FILE", help="Mapping file for other formats, or a shipped name."),
+        str, option("Mapping file for other formats, or a shipped name.", "--map", metavar="FILE")
     ] = "",
     dry_run: Annotated[
-        bool,
-        typer.Option("--dry-run", help="With --map: show how the recording is understood; write nothing."),
+        bool, option("With --map: show how the recording is understood; write nothing.", "--dry-run")
     ] = False,
     cir: CirOption = "final",
     longest_pause: Annotated[
-        float, typer.Option(metavar="SECONDS", help="Longer pauses are shortened to this; inf: never.")
+        float, option("Longer pauses are shortened to this; inf: never.", metavar="SECONDS")
     ] = _LONGEST_PAUSE_S,
     force: ForceOption = False,
     json: JsonOption = None,
@@ -88,18 +81,18 @@ def simulate(
     output: Annotated[Path, OUTPUT],
     like: Annotated[
         Literal["drive", "buildings"],
-        typer.Option(
-            help="drive: a robot that drives through a flat; buildings: static placements in random buildings, with "
+        option(
+            "drive: a robot that drives through a flat; buildings: static placements in random buildings, with "
             "different boards."
         ),
     ] = "drive",
-    seed: Annotated[int, typer.Option(help="Seed. Stamps start today at 0:00 UTC.")] = 1,
+    seed: Annotated[int, option("Seed. Stamps start today at 0:00 UTC.")] = 1,
     ranges: Annotated[
-        int, typer.Option(help="Number of ranges, including those that are too weak to be received.")
+        int, option("Number of ranges, including those that are too weak to be received.")
     ] = 20_000,
-    exchanges: Annotated[int, typer.Option(help="Exchanges of each static placement (buildings).")] = 20,
-    anchors: Annotated[int, typer.Option(help="Number of anchors of a drive, 4 to 8.")] = 4,
-    channel: Annotated[int, typer.Option(help="UWB channel: 1 to 5, or 7.")] = 2,
+    exchanges: Annotated[int, option("Exchanges of each static placement (buildings).")] = 20,
+    anchors: Annotated[int, option("Number of anchors of a drive, 4 to 8.")] = 4,
+    channel: Annotated[int, option("UWB channel: 1 to 5, or 7.")] = 2,
     force: ForceOption = False,
     json: JsonOption = None,
 ) -> None:
@@ -189,19 +182,15 @@ def _copy(
 
     damage: list[DamagedRecordingError] = []
     robot, row = _motion_of(sources[0], pauses.start_ns or 0), 0
-    with console.progress() as bar:
-        task = bar.add_task("writing", total=total)
+    with console.counting("writing", total) as counted:
         for source in sources:
             pauses.is_new_source = True
             try:
                 with source:
-                    for record in summary.watch(source):
-                        record = pauses.without(record)
+                    for record in map(pauses.without, counted(summary.watch(source))):
                         if robot is not None:
                             row = write_robot(bag, *robot, row, record.measurement.stamp_ns)
                         bag.write(record)
-                        if (count := summary.ranges) % _STRIDE == 0:
-                            bar.update(task, completed=count, description=f"writing: {count} ranges")
             except DamagedRecordingError as error:
                 damage.append(error)
     return damage[0] if damage else None
@@ -255,7 +244,7 @@ def _open(path: Path, cir: Literal["final", "poll"]) -> Source:
 
 @app.command()
 def info(
-    path: Annotated[Path, typer.Argument(metavar="PATH", help="A recording: log, folder or bag.")],
+    path: Annotated[Path, argument("PATH", "A recording: log, folder or bag.")],
     cir: CirOption = "final",
     json: JsonOption = None,
 ) -> None:
@@ -266,9 +255,9 @@ def info(
     source = _open(path, cir)
     summary = RecordingSummary()
     try:
-        with source, console.reading() as on_record:
-            for _ in summary.watch(source):
-                on_record()
+        with source, console.counting() as counted:
+            for _ in counted(summary.watch(source)):
+                pass
     finally:
         # Show the readable part before an error of the rest is raised.
         result = summary.as_json()

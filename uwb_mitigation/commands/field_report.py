@@ -26,7 +26,7 @@ import typer
 import uwb_mitigation
 from uwb_mitigation.commands.support import console
 from uwb_mitigation.commands.support.console import JsonOption, print_line
-from uwb_mitigation.commands.support.options import check_output, output_option
+from uwb_mitigation.commands.support.options import check_output, option, output_option
 from uwb_mitigation.errors import LinkError, ParameterError
 from uwb_mitigation.files import write_atomically
 
@@ -36,25 +36,23 @@ if TYPE_CHECKING:
 
 
 def field_report(
-    source: Annotated[
-        Literal["uci", "evb1000", "spi", "serial", "lines", "pans"], typer.Option(help="Kind of radio.")
-    ],
+    source: Annotated[Literal["uci", "evb1000", "spi", "serial", "lines", "pans"], option("Kind of radio.")],
     port: Annotated[
         str,
-        typer.Option(metavar="P[,P2]", help="Port of the tag, and of an anchor at this computer."),
+        option("Port of the tag, and of an anchor at this computer.", metavar="P[,P2]"),
     ],
-    distance: Annotated[float, typer.Option(help="Distance between the antennas, m.")],
+    distance: Annotated[float, option("Distance between the antennas, m.")],
     output: Annotated[Path, output_option("FILE.zip", "File to attach to an issue.")] = Path(
         "field_report.zip"
     ),
     mapping: Annotated[
-        str, typer.Option("--map", metavar="MAPPING", help="Mapping for the source lines, as for the driver.")
+        str, option("Mapping for the source lines, as for the driver.", "--map", metavar="MAPPING")
     ] = "",
-    seconds: Annotated[float, typer.Option(min=2.0, max=3600.0, help="Duration of the measurement.")] = 300.0,
+    seconds: Annotated[float, option("Duration of the measurement.", min=2.0, max=3600.0)] = 300.0,
     unplug: Annotated[
-        bool, typer.Option("--unplug/--no-unplug", help="Test unplugging and reconnecting the first port.")
+        bool, option("Test unplugging and reconnecting the first port.", "--unplug/--no-unplug")
     ] = True,
-    force: Annotated[bool, typer.Option("--force", help="Replace FILE.zip if it exists.")] = False,
+    force: Annotated[bool, option("Replace FILE.zip if it exists.", "--force")] = False,
     json: JsonOption = None,
 ) -> None:
     """Test a pair of radios at a known distance and write a report.

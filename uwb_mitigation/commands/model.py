@@ -8,11 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import typer
-
 from uwb_mitigation.commands.support import console, model_tables, options
 from uwb_mitigation.commands.support.bundles import show_models
 from uwb_mitigation.commands.support.console import JsonOption
+from uwb_mitigation.commands.support.options import argument, option
 from uwb_mitigation.errors import ParameterError
 
 if TYPE_CHECKING:
@@ -25,30 +24,28 @@ OutputOption = Annotated[Path, options.output_option("FILE", "Bundle to write.")
 
 def train(
     output: OutputOption,
-    data: Annotated[Path, typer.Option("--data", "--from-bag", help=_DATA_HELP)],
+    data: Annotated[Path, option(_DATA_HELP, "--data", "--from-bag")],
     truth: Annotated[
         list[Path] | None,
-        typer.Option(
-            metavar="CSV",
-            help="True ranges of the pairs (tag_id, anchor_id, range_m, and optionally start_s, stop_s, configuration, "
+        option(
+            "True ranges of the pairs (tag_id, anchor_id, range_m, and optionally start_s, stop_s, configuration, "
             "label) instead of those of the recording; may be given several times.",
+            metavar="CSV",
         ),
     ] = None,
     recipe_name: Annotated[
         Literal["auto", "constant", "line", "line+network", "network"],
-        typer.Option("--recipe", help="Kind of model; auto: selected by cross-validation."),
+        option("Kind of model; auto: selected by cross-validation.", "--recipe"),
     ] = "auto",
-    samples: Annotated[int, typer.Option(help="Window length K.")] = 157,
+    samples: Annotated[int, option("Window length K.")] = 157,
     scaling: Annotated[
-        options.ScalingName, typer.Option(help="Scaling of the CIR by its preamble count, or by its maximum.")
+        options.ScalingName, option("Scaling of the CIR by its preamble count, or by its maximum.")
     ] = "preamble",
-    epochs: Annotated[int | None, typer.Option(help="Passes over the data.")] = None,
-    learning_rate: Annotated[float | None, typer.Option(help="Learning rate of Adam.")] = None,
-    seed: Annotated[
-        int, typer.Option(help="Seed of the splits, the initial weights and the order of the data.")
-    ] = 0,
-    folds: Annotated[int, typer.Option(help="Number of folds of the cross-validation.")] = 6,
-    force: Annotated[bool, typer.Option("--force", help="Replace FILE if it exists.")] = False,
+    epochs: Annotated[int | None, option("Passes over the data.")] = None,
+    learning_rate: Annotated[float | None, option("Learning rate of Adam.")] = None,
+    seed: Annotated[int, option("Seed of the splits, the initial weights and the order of the data.")] = 0,
+    folds: Annotated[int, option("Number of folds of the cross-validation.")] = 6,
+    force: Annotated[bool, option("Replace FILE if it exists.", "--force")] = False,
     json: JsonOption = None,
 ) -> None:
     """Train a float bundle; the amount of data determines the complexity of the model.
@@ -82,27 +79,20 @@ def train(
 
 def train_universal(
     output: Annotated[Path, options.output_option("FILE", "int8 bundle to write.")],
-    seed: Annotated[
-        int, typer.Option(min=0, max=2**31, help="Seed of the simulated buildings and of the network.")
-    ] = 0,
-    samples: Annotated[int, typer.Option(help="Window length K.")] = 157,
-    scaling: Annotated[
-        options.ScalingName, typer.Option(help="max: for windows without preamble counts.")
-    ] = "preamble",
-    radio: Annotated[
-        Literal["dw1000", "dw3000"], typer.Option(help="dw3000: for windows of an STS.")
-    ] = "dw1000",
+    seed: Annotated[int, option("Seed of the simulated buildings and of the network.", min=0, max=2**31)] = 0,
+    samples: Annotated[int, option("Window length K.")] = 157,
+    scaling: Annotated[options.ScalingName, option("max: for windows without preamble counts.")] = "preamble",
+    radio: Annotated[Literal["dw1000", "dw3000"], option("dw3000: for windows of an STS.")] = "dw1000",
     blocks: Annotated[
-        int | None, typer.Option(min=1, max=10_000, help="Number of blocks of 256 placements for training.")
+        int | None, option("Number of blocks of 256 placements for training.", min=1, max=10_000)
     ] = None,
     float_output: Annotated[
-        Path | None, typer.Option("--float", metavar="FILE", help="Also write the float bundle.")
+        Path | None, option("Also write the float bundle.", "--float", metavar="FILE")
     ] = None,
     workers: Annotated[
-        int | None,
-        typer.Option(min=1, max=256, help="Processes of the simulation; default: one per processor."),
+        int | None, option("Processes of the simulation; default: one per processor.", min=1, max=256)
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace files that exist.")] = False,
+    force: Annotated[bool, option("Replace files that exist.", "--force")] = False,
     json: JsonOption = None,
 ) -> None:
     """Train a model for unknown sites in simulated buildings.
@@ -148,15 +138,10 @@ def train_universal(
 
 
 def quantise(
-    model: Annotated[
-        Path, typer.Argument(metavar="MODEL_FLOAT", help="Float bundle, as `train` or `--float` writes it.")
-    ],
-    data: Annotated[
-        Path,
-        typer.Option(help="Recording with CIRs, best the training data; true ranges are not needed."),
-    ],
+    model: Annotated[Path, argument("MODEL_FLOAT", "Float bundle, as `train` or `--float` writes it.")],
+    data: Annotated[Path, option("Recording with CIRs, best the training data; true ranges are not needed.")],
     output: OutputOption,
-    force: Annotated[bool, typer.Option("--force", help="Replace FILE if it exists.")] = False,
+    force: Annotated[bool, option("Replace FILE if it exists.", "--force")] = False,
     json: JsonOption = None,
 ) -> None:
     """Quantise a float bundle to int8.
@@ -170,8 +155,8 @@ def quantise(
     source = load_bundle(model)
     quantisation.check(source)
     options.check_output(output, force)
-    with console.reading() as on_record:
-        dataset = recordings.load_inputs(data, source.card.preprocessing, on_record)
+    with console.counting() as counted:
+        dataset = recordings.load_inputs(data, source.card.preprocessing, counted)
     console.show_skipped(dataset.skipped)
     bundle, difference = quantisation.quantise_bundle(source, dataset, output)
     model_tables.show_bundle(bundle)
@@ -194,17 +179,17 @@ def quantise(
 def _cross_validation(description: str, default: str, **limits: Any) -> Any:
     """Return an option of `evaluate --cross-validate`, which is an error without it."""
     text = f"With --cross-validate: {description} Default: {default}."
-    return typer.Option(help=text, show_default=False, **limits)
+    return option(text, show_default=False, **limits)
 
 
 def evaluate(
-    data: Annotated[Path, typer.Option(help=_DATA_HELP)],
+    data: Annotated[Path, option(_DATA_HELP)],
     model: options.ModelOption = None,
     offsets: options.OffsetsOption = None,
     cross_validate: Annotated[
         Literal["configuration"] | None,
-        typer.Option(
-            help="Instead of evaluating a model: fit the shipped recipe and the baselines, and test them on held-out "
+        option(
+            "Instead of evaluating a model: fit the shipped recipe and the baselines, and test them on held-out "
             "placements (configuration)."
         ),
     ] = None,
@@ -238,8 +223,8 @@ def evaluate(
     from uwb_mitigation.types.offsets import read_offsets
 
     mitigation = Mitigation(load_model(model), read_offsets(offsets or ""))
-    with open_recording(data) as source, console.reading() as on_record:
-        result = accuracy.evaluate_accuracy(mitigation, source, on_record)
+    with open_recording(data) as source, console.counting() as counted:
+        result = accuracy.evaluate_accuracy(mitigation, counted(source))
     model_tables.show_accuracy(result)
     if len(mitigation.used) > 1:
         show_models(mitigation.used)
@@ -268,7 +253,7 @@ def _dataset(data: Path, preprocessing: Preprocessing, truth: Sequence[Path] = (
     """Return name and measurements of a recording; print the number of skipped ranges by reason."""
     from uwb_mitigation.training.data import recordings
 
-    with console.reading() as on_record:
-        name, dataset = recordings.load_dataset(data, preprocessing, truth, on_record)
+    with console.counting() as counted:
+        name, dataset = recordings.load_dataset(data, preprocessing, truth, counted)
     console.show_skipped(dataset.skipped)
     return name, dataset

@@ -8,12 +8,10 @@ from dataclasses import asdict
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from uwb_mitigation.commands.support import console
 from uwb_mitigation.commands.support.bundles import bundle_for
 from uwb_mitigation.commands.support.console import JsonOption, print_line, show_table, warn
-from uwb_mitigation.commands.support.options import ModelOption, check_output, output_option
+from uwb_mitigation.commands.support.options import ModelOption, argument, check_output, option, output_option
 from uwb_mitigation.errors import ParameterError, parse_id
 
 if TYPE_CHECKING:
@@ -23,30 +21,22 @@ MAX_DISTANCE_M = 1000.0
 
 
 def offset(
-    bag: Annotated[
-        Path,
-        typer.Argument(
-            metavar="BAG", help="Ranges in line of sight: a bag, or a folder of DecaRanging logs."
-        ),
-    ],
-    distance: Annotated[
-        float | None, typer.Option(metavar="M", help="True distance between the antennas, m.")
-    ] = None,
+    bag: Annotated[Path, argument("BAG", "Ranges in line of sight: a bag, or a folder of DecaRanging logs.")],
+    distance: Annotated[float | None, option("True distance between the antennas, m.", metavar="M")] = None,
     truth: Annotated[
-        bool, typer.Option("--truth", help="Instead of --distance: use the true distances in the recording.")
+        bool, option("Instead of --distance: use the true distances in the recording.", "--truth")
     ] = False,
-    anchor: Annotated[str | None, typer.Option(metavar="ID", help="Only ranges of this anchor.")] = None,
-    tag: Annotated[str | None, typer.Option(metavar="ID", help="Only ranges of this tag.")] = None,
+    anchor: Annotated[str | None, option("Only ranges of this anchor.", metavar="ID")] = None,
+    tag: Annotated[str | None, option("Only ranges of this tag.", metavar="ID")] = None,
     model: ModelOption = None,
     output: Annotated[
         Path | None,
         output_option("FILE", "File to write, for --offsets and the parameter `offsets` of the nodes."),
     ] = None,
     common: Annotated[
-        bool,
-        typer.Option("--common", help="Write one offset, if the same boards were at several positions."),
+        bool, option("Write one offset, if the same boards were at several positions.", "--common")
     ] = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace files that exist.")] = False,
+    force: Annotated[bool, option("Replace files that exist.", "--force")] = False,
     json: JsonOption = None,
 ) -> None:
     """Estimate the range offset due to the antenna delays.
@@ -74,14 +64,9 @@ def offset(
         _id(name, text) if text is not None else None for name, text in (("anchor", anchor), ("tag", tag))
     )
     mitigation = Mitigation(bundle_for(model, bag))
-    with open_recording(bag) as source, console.reading() as on_record:
+    with open_recording(bag) as source, console.counting() as counted:
         estimate = radio_offsets.estimate_offset(
-            mitigation,
-            source,
-            distance,
-            tag_id=tag_id,
-            anchor_id=anchor_id,
-            on_record=on_record,
+            mitigation, counted(source), distance, tag_id=tag_id, anchor_id=anchor_id
         )
     _show(estimate)
     if output is not None:

@@ -6,17 +6,15 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from uwb_mitigation.commands.support import console, options
 from uwb_mitigation.commands.support.bundles import show_models
 from uwb_mitigation.commands.support.console import JsonOption, print_line, show_table, warn
-from uwb_mitigation.commands.support.options import check_replaceable, output_option
+from uwb_mitigation.commands.support.options import argument, check_replaceable, option, output_option
 from uwb_mitigation.errors import ParameterError, check_name, format_id
 
 if TYPE_CHECKING:
     from uwb_mitigation.calibration.survey import SurveyResult
-    from uwb_mitigation.commands.offline.track import HoldoutErrors
+    from uwb_mitigation.commands.offline import track as tracking
     from uwb_mitigation.mitigation.correction import Mitigation
     from uwb_mitigation.positioning.config import EstimatorConfig
     from uwb_mitigation.positioning.recorded_tracks import TagTracks
@@ -44,9 +42,7 @@ TRACK_COLUMNS = {
     "epochs": "epochs:d",
 }
 
-BagArgument = Annotated[
-    Path, typer.Argument(metavar="BAG", help="An MCAP bag with ranges, corrected or raw.")
-]
+BagArgument = Annotated[Path, argument("BAG", "An MCAP bag with ranges, corrected or raw.")]
 
 
 @options.with_settings()
@@ -56,17 +52,15 @@ def track(
     settings: TrackSettings,
     anchors: options.AnchorsOption = None,
     tum: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Also write the smoothed track in TUM's format, as evo reads it."),
+        Path | None, option("Also write the smoothed track in TUM's format, as evo reads it.", metavar="FILE")
     ] = None,
     report: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Also write an HTML page: verdict, map, errors over time."),
+        Path | None, option("Also write an HTML page: verdict, map, errors over time.", metavar="FILE")
     ] = None,
     png: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Also draw a map of the tracks (needs matplotlib).")
+        Path | None, option("Also draw a map of the tracks (needs matplotlib).", metavar="FILE")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace what exists.")] = False,
+    force: Annotated[bool, option("Replace what exists.", "--force")] = False,
     json: JsonOption = None,
 ) -> None:
     """Estimate the tracks of a recording's tags: filtered and smoothed.
@@ -81,47 +75,42 @@ def track(
 
         uwb-mitigation track drive.mcap -o track.mcap --odometry /odom --imu /imu
     """
-    from uwb_mitigation.commands.offline.track import (
-        held_out,
-        mitigation,
-        tum_file,
-        worst_displaced,
-        write_tracks,
-    )
-    from uwb_mitigation.commands.offline.track import tum as tum_text
+    from uwb_mitigation.commands.offline import track as tracking
     from uwb_mitigation.files import write_atomically
     from uwb_mitigation.positioning.recorded_tracks import track_tags
     from uwb_mitigation.recordings.bag.writer import BagWriter
     from uwb_mitigation.types.anchors import anchors_path, save_anchors
 
-    corrector = mitigation(settings)
+    corrector = tracking.mitigation(settings)
     config, recorded = _read(bag, anchors, settings, corrector)
     if not corrector.used and (settings.model or settings.offsets):
         raise ParameterError("--model or --offsets", where=str(bag), valid="a bag without corrected ranges")
     show_models(corrector.used)
     several = len(recorded.tags) > 1
-    tum_files = {tag.tag_id: tum_file(tum, tag.tag_id, several) for tag in recorded.tags if tum is not None}
+    tum_files = {
+        tag.tag_id: tracking.tum_file(tum, tag.tag_id, several) for tag in recorded.tags if tum is not None
+    }
     check_replaceable((*tum_files.values(), *filter(None, (report, png))), force)
     origin = {"source": f"track of {bag.name}", "simulated": "false"}
     with BagWriter(output, origin, force=force) as out:
         with console.step_bar("tracking tags", len(recorded.tags)) as advance:
             tracks, failures = track_tags(recorded.tags, config, advance)
-        write_tracks(out, tracks)
+        tracking.write_tracks(out, tracks)
     for failure in failures:
         warn(f"{failure}.")
     if force or not anchors_path(output).exists():
         save_anchors(anchors_path(output), config.anchors, f"anchors of the track of {bag.name}", force=True)
     _show_tracks(tracks)
-    residuals = held_out(tracks, config)
+    residuals = tracking.held_out(tracks, config)
     _show_residuals(residuals, config.anchors)
     print_line(f"Wrote {out.counts.total()} messages to {out.file}.")
     for tracked in tracks if tum is not None else []:
-        write_atomically(tum_files[tracked.recording.tag_id], tum_text(tracked.smoothed))
+        write_atomically(tum_files[tracked.recording.tag_id], tracking.tum(tracked.smoothed))
     if report is not None:
         from uwb_mitigation.viewer.report import write_report
 
-        displaced, offset_s = worst_displaced(residuals), settings.stamp_offset_s
-        write_report(report, bag, config, lambda: mitigation(settings), tracks, displaced, offset_s)
+        displaced, offset_s = tracking.worst_displaced(residuals), settings.stamp_offset_s
+        write_report(report, bag, config, lambda: tracking.mitigation(settings), tracks, displaced, offset_s)
         print_line(f"Wrote {report}.")
     if png is not None:
         from uwb_mitigation.commands.offline.tracks import Tracks
@@ -139,14 +128,12 @@ def survey(
     output: Annotated[Path, output_option("FILE", "The anchors file to write.")],
     settings: TrackSettings,
     anchors: options.AnchorsOption = None,
-    off: Annotated[
-        float, typer.Option(help="Standard deviation of the guesses in FILE, m in each coordinate.")
-    ] = 1.0,
+    off: Annotated[float, option("Standard deviation of the guesses in FILE, m in each coordinate.")] = 1.0,
     fixed: Annotated[
         list[str] | None,
-        typer.Option("--fixed", metavar="ID", help="An anchor that is where FILE says; may be repeated."),
+        option("An anchor that is where FILE says; may be repeated.", "--fixed", metavar="ID"),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace FILE if it exists.")] = False,
+    force: Annotated[bool, option("Replace FILE if it exists.", "--force")] = False,
     json: JsonOption = None,
 ) -> None:
     """Estimate anchor positions from rough guesses and a drive past them.
@@ -182,13 +169,13 @@ def survey(
 def _read(
     bag: Path, anchors: Path | None, settings: TrackSettings, mitigation: Mitigation | None = None
 ) -> tuple[EstimatorConfig, RecordedRanges]:
-    from uwb_mitigation.commands.offline.track import read_config
+    from uwb_mitigation.commands.offline import track as tracking
     from uwb_mitigation.positioning.recorded_tracks import check_one_tag
     from uwb_mitigation.recordings.bag.anchor_markers import read_anchors
     from uwb_mitigation.recordings.formats import open_recording
     from uwb_mitigation.recordings.recorded_ranges import read_ranges
 
-    config = read_config(bag, read_anchors(bag, anchors), settings, warn)
+    config = tracking.read_config(bag, read_anchors(bag, anchors), settings, warn)
     with console.step_bar("reading"):
         corrected = () if mitigation is None else mitigation.correct_records(open_recording(bag))
         recorded = read_ranges(bag, config.anchors, settings.stamp_offset_s, corrected)
@@ -227,7 +214,7 @@ def _show_tracks(tracks: list[TagTracks]) -> None:
             warn(f"{name}: {warning}.")
 
 
-def _show_residuals(residuals: list[HoldoutErrors], anchors: AnchorMap) -> None:
+def _show_residuals(residuals: list[tracking.HoldoutErrors], anchors: AnchorMap) -> None:
     from uwb_mitigation.calibration.hypotheses import fit_text
 
     rows: list[dict[str, Any]] = [

@@ -8,13 +8,12 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
 from rich.markup import escape
 
-from uwb_mitigation.commands.support import console
+from uwb_mitigation.commands.support import console, options
 from uwb_mitigation.commands.support.bundles import show_models
 from uwb_mitigation.commands.support.console import JsonOption, show_table
-from uwb_mitigation.commands.support.options import ModelOption, OffsetsOption, output_option
+from uwb_mitigation.commands.support.options import argument, option, output_option
 from uwb_mitigation.errors import ParameterError, RecordingError, UwbMitigationError
 from uwb_mitigation.files import os_errors
 
@@ -23,9 +22,7 @@ if TYPE_CHECKING:
 
 
 def process(
-    sources: Annotated[
-        list[Path], typer.Argument(metavar="IN...", help="Bags, or folders of bags at any depth.")
-    ],
+    sources: Annotated[list[Path], argument("IN...", "Bags, or folders of bags at any depth.")],
     output: Annotated[
         Path,
         output_option(
@@ -33,17 +30,15 @@ def process(
             "For one bag: OUT.mcap for one file, any other name for a bag folder. For several bags: a folder.",
         ),
     ],
-    model: ModelOption = None,
-    offsets: OffsetsOption = None,
+    model: options.ModelOption = None,
+    offsets: options.OffsetsOption = None,
     workers: Annotated[
-        int | None,
-        typer.Option("-j", "--jobs", help="Bags processed at the same time. Default: number of cores."),
+        int | None, option("Bags processed at the same time. Default: number of cores.", "-j", "--jobs")
     ] = None,
     scheduler: Annotated[
-        str | None,
-        typer.Option(metavar="ADDRESS", help="Address of the scheduler of a Dask cluster: tcp://HOST:8786."),
+        str | None, option("Address of the scheduler of a Dask cluster: tcp://HOST:8786.", metavar="ADDRESS")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace outputs that exist.")] = False,
+    force: Annotated[bool, option("Replace outputs that exist.", "--force")] = False,
     json: JsonOption = None,
 ) -> None:
     """Copy bags and add a corrected range after each raw one.

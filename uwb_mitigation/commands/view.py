@@ -8,10 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from uwb_mitigation.commands.support import console, options
 from uwb_mitigation.commands.support.bundles import show_models
+from uwb_mitigation.commands.support.options import argument, option
 
 if TYPE_CHECKING:
     from uwb_mitigation.positioning.track_settings import TrackSettings
@@ -21,32 +20,26 @@ if TYPE_CHECKING:
 def view(
     bag: Annotated[
         Path,
-        typer.Argument(
-            metavar="BAG",
-            help="An MCAP bag or rosbag2 folder with ranges (raw or corrected), or the output of `track`.",
+        argument(
+            "BAG", "An MCAP bag or rosbag2 folder with ranges (raw or corrected), or the output of `track`."
         ),
     ],
     settings: TrackSettings,
     anchors: options.AnchorsOption = None,
     namespace: Annotated[
         str | None,
-        typer.Option(
-            metavar="NAMESPACE", help="Namespace of the ranges, such as /board1, if BAG has several."
-        ),
+        option("Namespace of the ranges, such as /board1, if BAG has several.", metavar="NAMESPACE"),
     ] = None,
     host: Annotated[
-        str,
-        typer.Option(metavar="ADDRESS", help="Address to serve at; 0.0.0.0 = every address of this machine."),
+        str, option("Address to serve at; 0.0.0.0 = every address of this machine.", metavar="ADDRESS")
     ] = "localhost",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 = a free one.")] = 5006,
+    port: Annotated[int, option("Port; 0 = a free one.", min=0, max=65535)] = 5006,
     origins: Annotated[
         list[str] | None,
-        typer.Option(metavar="HOST:PORT", help="Further address of the page, for a proxy or a host name."),
+        option("Further address of the page, for a proxy or a host name.", metavar="HOST:PORT"),
     ] = None,
-    token: Annotated[
-        bool, typer.Option("--token", help="Require a generated token, which is part of the URL.")
-    ] = False,
-    browser: Annotated[bool, typer.Option("--browser", help="Open the page in the browser.")] = False,
+    token: Annotated[bool, option("Require a generated token, which is part of the URL.", "--token")] = False,
+    browser: Annotated[bool, option("Open the page in the browser.", "--browser")] = False,
 ) -> None:
     """Show a recording in the browser: map, ranges, CIRs.
 

@@ -468,5 +468,4 @@ def _subtract_offset(range_m: NDArray[np.floating], offset_m: NDArray[np.float32
 
 
 def _is_valid_range(range_m: NDArray[np.floating]) -> NDArray[np.bool_]:
-    valid: NDArray[np.bool_] = (range_m >= 0.0) & (range_m <= MAX_RANGE_M)
-    return valid
+    return (range_m >= 0.0) & (range_m <= MAX_RANGE_M)

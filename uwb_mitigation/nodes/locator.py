@@ -22,14 +22,7 @@ from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 from visualization_msgs.msg import MarkerArray
 
 from uwb_mitigation.errors import MissingDependencyError, ParameterError, RecordingError, format_id
-from uwb_mitigation.nodes import markers
-from uwb_mitigation.nodes.robot_motion import (
-    HOLD_S,
-    MotionState,
-    OdometryInput,
-    make_transform,
-    transform_type,
-)
+from uwb_mitigation.nodes import markers, robot_motion
 from uwb_mitigation.nodes.support import diagnostics, endpoints
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode
 from uwb_mitigation.nodes.support.position_monitor import PositionMonitor
@@ -41,23 +34,7 @@ from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.dead_reckoning import DeadReckoning
 from uwb_mitigation.types.anchors import AnchorMap, load_anchors
 from uwb_mitigation.types.measurement import CorrectedBy, CorrectedRange, RangeMeasurement, Status
-from uwb_mitigation.types.ros import topics
-from uwb_mitigation.types.ros.codec import (
-    MeasurementKey,
-    decode_corrected,
-    decode_frame_id,
-    decode_range,
-    measurement_key,
-)
-from uwb_mitigation.types.ros.poses import (
-    BodyTwist,
-    encode_odometry,
-    encode_pose,
-    prepare_encoders,
-    tag_frame,
-    tag_of_frame,
-    tag_topic,
-)
+from uwb_mitigation.types.ros import codec, poses, topics
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Estimate, Heading
 
@@ -88,9 +65,11 @@ class _Outputs:
     """
 
     def __init__(self, node: Locator, tag: TagState, number: int | None, frame: str) -> None:
-        self.pose = node.publisher(PoseWithCovarianceStamped, tag_topic(topics.POSE, number))
-        self.odometry = node.publisher(Odometry, tag_topic(topics.ODOMETRY, number))
-        self.smoothed = node.publisher(PoseWithCovarianceStamped, tag_topic(topics.POSE_SMOOTHED, number))
+        self.pose = node.publisher(PoseWithCovarianceStamped, poses.tag_topic(topics.POSE, number))
+        self.odometry = node.publisher(Odometry, poses.tag_topic(topics.ODOMETRY, number))
+        self.smoothed = node.publisher(
+            PoseWithCovarianceStamped, poses.tag_topic(topics.POSE_SMOOTHED, number)
+        )
         self.frame = frame
         self.robot = tag.robot
         self.picture = markers.TagPicture(frame)
@@ -111,12 +90,12 @@ class Locator(ManagedNode):
         self._anchors_out: Publisher | None = None
         self._tf: Publisher | None = None
         self._tf_type: Any = None
-        self._decode: Callable[[bytes], tuple[MeasurementKey, CorrectedRange]] = decode_corrected
+        self._decode: Callable[[bytes], tuple[codec.MeasurementKey, CorrectedRange]] = codec.decode_corrected
         self._make_estimator: Callable[[AnchorMap], MultiTagEstimator]
         self._plain_tag = 0
         self._transform_ns: dict[str, int] = {}
         self._outputs: dict[int, _Outputs] = {}
-        self._robot: OdometryInput | None = None
+        self._robot: robot_motion.OdometryInput | None = None
         self._lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
         self._ranges_topic, self._good_s, self._has_warned = "", math.inf, False
         self._malformed = self._lost = 0
@@ -152,14 +131,15 @@ class Locator(ManagedNode):
         self._period_ns = round(NS_PER_S / self.value("rate")) if self.value("rate") > 0 else 0
         self._offset_ns = round(self.value("stamp_offset") * NS_PER_S)
         self._map, self._plain_frame = self.value("map_frame"), self.value("tag_frame")
-        if tag_of_frame(self._plain_frame) not in (None, self.value("tag")) or self._plain_frame == self._map:
+        frame_tag = poses.tag_of_frame(self._plain_frame)
+        if frame_tag not in (None, self.value("tag")) or self._plain_frame == self._map:
             raise ParameterError(
                 f"parameter tag_frame = {self._plain_frame!r} is the frame of another tag or of the map",
                 valid="a name of its own, such as uwb_tag",
             )
         self._tolerance_ns = round(self.value("transform_tolerance") * NS_PER_S)
         if self.value("publish_tf"):
-            self._tf_type = transform_type()
+            self._tf_type = robot_motion.transform_type()
             if self._tf_type is None:
                 raise MissingDependencyError(
                     "publish_tf needs tf2_msgs, which is not installed",
@@ -167,7 +147,7 @@ class Locator(ManagedNode):
                 )
             self._tf = self.publisher(self._tf_type, topics.TF, QoSProfile(depth=100))
         if robot is not None:
-            self._robot = OdometryInput(self, path_of_base)
+            self._robot = robot_motion.OdometryInput(self, path_of_base)
         kind, _, topic = path.partition(":")
         if kind not in markers.ANCHOR_TYPES:
             self._use_anchors(load_anchors(Path(path).expanduser()))
@@ -254,7 +234,9 @@ class Locator(ManagedNode):
                 self.destroy_at_close(feed, lambda feed: feed.stop()).start()
                 return mapping.range_sd
         kind, name = RangeCir if source else RangeCorrected, source or topics.relative(topics.RANGE_CORRECTED)
-        self._decode = (lambda data: _uncorrected(decode_range(data))) if source else decode_corrected
+        self._decode = (
+            (lambda data: _uncorrected(codec.decode_range(data))) if source else codec.decode_corrected
+        )
         self._ranges_topic = self.resolve_topic_name(name)
         ranges = endpoints.create_raw_subscription(self, kind, name, self._on_range, self._on_lost)
         self.destroy_at_close(ranges, self.destroy_subscription)
@@ -276,12 +258,12 @@ class Locator(ManagedNode):
         self.get_logger().info(f"{len(anchors)} anchors from {self.value('anchors')}")
         digest = hashlib.sha256(repr(anchors.anchors).encode()).hexdigest()
 
-        def read(saved: Any) -> tuple[int, MotionState | None]:
+        def read(saved: Any) -> tuple[int, robot_motion.MotionState | None]:
             if saved["anchors"] != digest:
                 raise ValueError("other anchors")
-            return int(saved["tag"]), saved["motion"] and MotionState.read(saved["motion"])
+            return int(saved["tag"]), saved["motion"] and robot_motion.MotionState.read(saved["motion"])
 
-        if (state := self._state_file.load(HOLD_S, read)) is not None:
+        if (state := self._state_file.load(robot_motion.HOLD_S, read)) is not None:
             self._plain_tag, motion = self._plain_tag or state[0], state[1]
             if self._robot is not None and motion is not None:
                 self._robot.resume(motion)
@@ -309,10 +291,12 @@ class Locator(ManagedNode):
             self._malformed += 1
             self.get_logger().warning(f"a message cannot be read: {error}", throttle_duration_sec=10.0)
             return
-        self._update_lever_arm(key.tag_id, lambda: decode_frame_id(data))
+        self._update_lever_arm(key.tag_id, lambda: codec.decode_frame_id(data))
         self._add(estimator, key, corrected)
 
-    def _add(self, estimator: MultiTagEstimator, key: MeasurementKey, corrected: CorrectedRange) -> None:
+    def _add(
+        self, estimator: MultiTagEstimator, key: codec.MeasurementKey, corrected: CorrectedRange
+    ) -> None:
         began_ns = time.perf_counter_ns()
         stamp_ns = key.stamp_ns + self._offset_ns
         measured = corrected.range_m, corrected.variance_m2, corrected.status.is_corrected
@@ -350,7 +334,7 @@ class Locator(ManagedNode):
         if outputs is None:
             self._plain_tag = self._plain_tag or tag.tag_id
             plain = tag.tag_id == self._plain_tag
-            name = self._plain_frame if plain else tag_frame(tag.tag_id)
+            name = self._plain_frame if plain else poses.tag_frame(tag.tag_id)
             # Tags of several robots share the map, so the namespace keeps their frames apart.
             frame = f"{self.get_namespace()}/{name}".lstrip("/")
             outputs = _Outputs(self, tag, None if plain else tag.tag_id, frame)
@@ -375,21 +359,21 @@ class Locator(ManagedNode):
                 trusts = not outputs.robot.rejects_odometry
                 self._publish_base(outputs, self._robot.mixed(base, trusts_odometry=trusts))
             return
-        outputs.pose.publish(encode_pose(base, self._map))
-        outputs.odometry.publish(encode_odometry(estimate, self._map, outputs.frame))
+        outputs.pose.publish(poses.encode_pose(base, self._map))
+        outputs.odometry.publish(poses.encode_odometry(estimate, self._map, outputs.frame))
         if self._tf is not None:
             pose = estimate.stamp_ns, self._map, outputs.frame, estimate.position.tolist()
-            self._publish_transform(make_transform(*pose), estimate.stamp_ns)
+            self._publish_transform(robot_motion.make_transform(*pose), estimate.stamp_ns)
 
     def _publish_base(self, outputs: _Outputs, base: Estimate) -> None:
         """Publish the pose of the robot, and the transform from map to odom."""
         motion, robot = self._robot, outputs.robot
         assert motion is not None
         assert robot is not None
-        outputs.pose.publish(encode_pose(base, self._map))
-        twist = BodyTwist() if robot.rejects_odometry else motion.twist(base.stamp_ns)
+        outputs.pose.publish(poses.encode_pose(base, self._map))
+        twist = poses.BodyTwist() if robot.rejects_odometry else motion.twist(base.stamp_ns)
         frame = motion.state.base_frame or "base_link"
-        outputs.odometry.publish(encode_odometry(base, self._map, frame, twist))
+        outputs.odometry.publish(poses.encode_odometry(base, self._map, frame, twist))
         self._publish_transform(motion.map_to_odom(base, self._tolerance_ns), base.stamp_ns)
 
     def _publish_transform(
@@ -445,7 +429,7 @@ class Locator(ManagedNode):
                 outputs.smoothed_ns = tag.latest_ns
                 smoothed = tag.smoother.estimate()
                 if smoothed is not None:
-                    outputs.smoothed.publish(encode_pose(self._at_base(outputs, smoothed), self._map))
+                    outputs.smoothed.publish(poses.encode_pose(self._at_base(outputs, smoothed), self._map))
         if self._robot is not None:
             # Also before the first range after a crash.
             latest_ns = max((tag.latest_ns for tag in estimator.tags.values() if tag.robot), default=stamp_ns)
@@ -458,7 +442,7 @@ class Locator(ManagedNode):
             self._state_file.save(self._saved_state)
         else:
             # Not before the last transform is repeated after a crash: the first call takes long.
-            prepare_encoders()
+            poses.prepare_encoders()
 
     def _show_anchors(self) -> None:
         estimator, publisher = self._estimator, self._anchors_out
@@ -479,8 +463,8 @@ class Locator(ManagedNode):
             tag.add_height(float(message.pose.pose.position.z), float(message.pose.covariance[14]))
 
 
-def _uncorrected(measurement: RangeMeasurement) -> tuple[MeasurementKey, CorrectedRange]:
+def _uncorrected(measurement: RangeMeasurement) -> tuple[codec.MeasurementKey, CorrectedRange]:
     """Return a raw range with the status of one that was not corrected; its variance is `range_sd`."""
     range_m = measurement.range_m
     corrected = CorrectedRange(range_m, range_m, 0.0, math.nan, Status.NO_CIR, CorrectedBy.HOST, 0)
-    return measurement_key(measurement), corrected
+    return codec.measurement_key(measurement), corrected

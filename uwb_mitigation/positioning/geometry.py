@@ -161,8 +161,7 @@ class Symmetry:
             return (position - 2.0 * along)[None]
         angle = np.arange(1, CIRCLE_POINTS)[:, None] * (math.tau / CIRCLE_POINTS)
         across, turned = offset - along, np.cross(self.axis, offset)
-        images: NDArray[np.float64] = self.center + along + np.cos(angle) * across + np.sin(angle) * turned
-        return images
+        return np.asarray(self.center + along + np.cos(angle) * across + np.sin(angle) * turned, np.float64)
 
 
 def separation(
@@ -187,8 +186,7 @@ def separation(
     diagonal = normal.reshape(len(images), -1)[:, :: dims + 2]
     diagonal += [*[IMAGE_SHIFT_M**-2] * dims, max(offset_sd_m, 1e-3) ** -2]
     squared = (difference**2).sum(axis=1) - (right * np.linalg.solve(normal, right)).sum(axis=1)
-    separations: NDArray[np.float64] = np.sqrt(np.maximum(squared[:, 0], 0.0))
-    return separations
+    return np.asarray(np.sqrt(np.maximum(squared[:, 0], 0.0)), np.float64)
 
 
 def constant_error_gain(
@@ -265,5 +263,4 @@ def protection_levels(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
     and are no certified integrity figures as in aviation.
     """
     variances = np.einsum("...ii->...i", covariance)[..., :3]
-    levels: NDArray[np.float64] = PROTECTION * np.sqrt(variances)
-    return levels
+    return np.asarray(PROTECTION * np.sqrt(variances), np.float64)

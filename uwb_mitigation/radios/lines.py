@@ -14,17 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from uwb_mitigation.errors import LinkError, ParameterError, RecordingError
+from uwb_mitigation.radios import port
 from uwb_mitigation.radios.capture import Capture, Session
-from uwb_mitigation.radios.port import (
-    ExchangeMonitor,
-    PortAddress,
-    PortReport,
-    StreamPlace,
-    StreamPort,
-    StreamSettings,
-    stream_opener,
-)
-from uwb_mitigation.radios.settings import PortMessage, ValueReader, read_baud, read_capture, read_ports
+from uwb_mitigation.radios.parameters import ValueReader, read_baud, read_capture, read_ports
+from uwb_mitigation.radios.settings import PortMessage
 from uwb_mitigation.recordings.live_ranges import LiveConverter
 from uwb_mitigation.recordings.mapping.conversion import UNREADABLE
 from uwb_mitigation.recordings.mapping.mapping import Mapping, StartDialogue, load_mapping
@@ -52,7 +45,7 @@ _LINE_COUNTS = (_LINES, _NO_MATCH, _TOO_LONG, _STARTS)
 
 
 @dataclass(frozen=True)
-class UdpAddress(PortAddress):
+class UdpAddress(port.PortAddress):
     """An address at which datagrams are received, instead of a serial port; each ends a line.
 
     Attributes:
@@ -80,7 +73,7 @@ class UdpAddress(PortAddress):
 
 
 @dataclass(frozen=True)
-class LineSettings(StreamSettings):
+class LineSettings(port.StreamSettings):
     """Settings of a board; `mapping`: where the values are in its lines, and the baud rate unless there is another one."""
 
     mapping: Mapping
@@ -89,7 +82,7 @@ class LineSettings(StreamSettings):
 
 def read_settings(value: ValueReader) -> list[LineSettings]:
     """Return the settings of the boards at `port`; raise ParameterError if a parameter is invalid."""
-    addresses, mapping = [parse_address(port) for port in read_ports(value)], read_mapping(value)
+    addresses, mapping = [parse_address(text) for text in read_ports(value)], read_mapping(value)
     line = {"baud": read_baud(value, mapping.baud), "dtr": value("dtr"), "capture": read_capture(value)}
     return [LineSettings(address, mapping, **line) for address in addresses]
 
@@ -105,14 +98,14 @@ def read_mapping(value: ValueReader) -> Mapping:
     return mapping
 
 
-def parse_address(text: str) -> PortAddress:
+def parse_address(text: str) -> port.PortAddress:
     """Read `udp:PORT` or `udp:ADDRESS:PORT`, or an address of `PortAddress`; raise ParameterError for other texts."""
     if not text.startswith("udp:"):
-        return PortAddress.parse(text)
-    host, _, port = text.removeprefix("udp:").rpartition(":")
-    if not port.isdecimal() or not 0 < int(port) < 65536:
+        return port.PortAddress.parse(text)
+    host, _, number = text.removeprefix("udp:").rpartition(":")
+    if not number.isdecimal() or not 0 < int(number) < 65536:
         raise ParameterError(f"the port {text!r:.60}", valid="udp:PORT or udp:ADDRESS:PORT, such as udp:8000")
-    return UdpAddress(host=host, number=int(port))
+    return UdpAddress(host=host, number=int(number))
 
 
 def open_capture(path: Path, value: ValueReader) -> Capture:
@@ -252,23 +245,23 @@ class LineSession(Session):
             self._pause_ns = min(2 * self._pause_ns, MAX_PAUSE_NS)
 
 
-class LinePort(StreamPort):
+class LinePort(port.StreamPort):
     """Operates one board until `close`; see `StreamPort`. Events are measurements and `PortMessage`."""
 
     session: LineSession
 
-    def __init__(self, settings: LineSettings, place: StreamPlace) -> None:
+    def __init__(self, settings: LineSettings, place: port.StreamPlace) -> None:
         self._is_udp = isinstance(settings.address, UdpAddress)
         session = LineSession(settings.mapping, place[0], has_datagrams=self._is_udp)
         settings = replace(settings, baud=settings.baud or settings.mapping.baud)
-        super().__init__(settings, session, ExchangeMonitor({}), place)
+        super().__init__(settings, session, port.ExchangeMonitor({}), place)
         self._mapping, self._received_ns, self._has_ranges = settings.mapping, 0, False
         self._empty_read_is_loss = not self._is_udp
 
     def apply(self, settings: LineSettings) -> None:
         """Change nothing: no parameter of this source is live."""
 
-    def report(self) -> PortReport:
+    def report(self) -> port.PortReport:
         """Return the present state."""
         with self._lock:
             session = self.session
@@ -277,7 +270,7 @@ class LinePort(StreamPort):
                 values["last line that does not match"] = session.example
             values |= {"bytes": session.received, "openings": self.openings}
             hardware = f"{session.mapping.name} at {self._name}"
-            return PortReport(self.device, hardware, self.problem, self._warning(), "receiving", values)
+            return port.PortReport(self.device, hardware, self.problem, self._warning(), "receiving", values)
 
     def _warning(self) -> str:
         session, text = self.session, self.monitor.warning()
@@ -318,4 +311,4 @@ class LinePort(StreamPort):
         return measurements
 
 
-open = stream_opener(LinePort, "lines")
+open = port.stream_opener(LinePort, "lines")

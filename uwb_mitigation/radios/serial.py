@@ -10,36 +10,13 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from uwb_mitigation.errors import LinkError, ParameterError, format_id
-from uwb_mitigation.radios.port import (
-    ExchangeMonitor,
-    PortAddress,
-    PortReport,
-    StreamPlace,
-    StreamPort,
-    StreamSettings,
-    processes_using,
-    stream_opener,
-)
-from uwb_mitigation.radios.settings import (
-    DEFAULT_RADIO,
-    EXCHANGE_REMEDIES,
-    STATE_PROBLEMS,
-    PortMessage,
-    RadioSettings,
-    RadioStatus,
-    Role,
-    ValueReader,
-    radio_values,
-    read_baud,
-    read_radio,
-    settings_text,
-    status_warning,
-)
-from uwb_mitigation.radios.wire import events
-from uwb_mitigation.radios.wire.events import Event, LinkState, Loss
+from uwb_mitigation.radios import port
+from uwb_mitigation.radios.parameters import ValueReader, read_baud, read_radio
+from uwb_mitigation.radios.settings import DEFAULT_RADIO, PortMessage, RadioSettings, RadioStatus, Role
+from uwb_mitigation.radios.wire import session as sessions
 from uwb_mitigation.radios.wire.layout import LogLevel, Mode
 from uwb_mitigation.radios.wire.messages import BoardStatus, Correction, Hello, Log, RadioConfigured
-from uwb_mitigation.radios.wire.session import BoardSession
+from uwb_mitigation.radios.wire.session import BoardSession, Event, LinkState, Loss, Refused
 from uwb_mitigation.types.measurement import RangeMeasurement
 from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets, read_offsets
 
@@ -50,7 +27,7 @@ REOPEN_TIMEOUT_NS = 10 * 10**9
 
 
 @dataclass(frozen=True, kw_only=True)
-class SerialSettings(StreamSettings):
+class SerialSettings(port.StreamSettings):
     """Settings of a board with the wire protocol.
 
     Attributes:
@@ -76,7 +53,7 @@ def read_settings(value: ValueReader) -> list[SerialSettings]:
         )
     radio = read_radio(value)
     settings = SerialSettings(
-        PortAddress.parse(value("port")),
+        port.PortAddress.parse(value("port")),
         baud=read_baud(value, BAUD),
         dtr=value("dtr"),
         mode=Mode[value("mode").upper()],
@@ -87,7 +64,7 @@ def read_settings(value: ValueReader) -> list[SerialSettings]:
     return [settings]
 
 
-class BoardPort(StreamPort):
+class BoardPort(port.StreamPort):
     """Keeps a board connected until `close`; reconnects after unplugging, resets, timeouts and noise; see `StreamPort`.
 
     Events are measurements, corrections, events of the session and `PortMessage`.
@@ -97,9 +74,9 @@ class BoardPort(StreamPort):
 
     _range_types = (RangeMeasurement, Correction)
 
-    def __init__(self, settings: SerialSettings, place: StreamPlace) -> None:
+    def __init__(self, settings: SerialSettings, place: port.StreamPlace) -> None:
         session = BoardSession(mode=settings.mode, expected_model_id=settings.model_id)
-        super().__init__(settings, session, ExchangeMonitor(EXCHANGE_REMEDIES), place)
+        super().__init__(settings, session, port.ExchangeMonitor(RadioStatus.REMEDIES), place)
         self._board = settings
         self._connections = 0
         self._other_users = ""
@@ -118,11 +95,11 @@ class BoardPort(StreamPort):
         with self._lock:
             before, self._board = self._board, settings
             if settings.radio != before.radio:
-                self._refused.pop(events.RADIO_PROBLEM, None)
+                self._refused.pop(sessions.RADIO_PROBLEM, None)
                 self.session.set_radio(settings.radio or DEFAULT_RADIO)
             has_new_offsets = (settings.mode, settings.offsets) != (before.mode, before.offsets)
             if settings.mode is Mode.DEVICE and has_new_offsets:
-                self._refused.pop(events.OFFSETS_PROBLEM, None)
+                self._refused.pop(sessions.OFFSETS_PROBLEM, None)
                 self.session.set_offsets(settings.offsets)
             if settings.mode is not None and settings.mode != before.mode:
                 self.session.set_mode(settings.mode)
@@ -141,7 +118,7 @@ class BoardPort(StreamPort):
                 return f"{session.state.value}{users}"
             return "" if session.model_matches else "the board has another model than the expected one"
 
-    def report(self) -> PortReport:
+    def report(self) -> port.PortReport:
         """Return the present state."""
         with self._lock:
             hello, clock = self.session.hello, self.session.clock
@@ -169,18 +146,18 @@ class BoardPort(StreamPort):
             if radio is not None:
                 hardware += f", radio {format_id(radio.address)}"
             if status is not None:
-                values |= radio_values(radio, status, "radio: ")
-                problems.append(STATE_PROBLEMS.get(status.state, ""))
-                warning = status_warning(status)
+                values |= status.values(radio, "radio: ")
+                problems.append(status.problem)
+                warning = status.warning
             if radio is None or radio.role is Role.TAG or radio.report:
                 exchanges = self.monitor.warning(radio.interval_us / 1e6 if radio is not None else 0.0)
                 warning = warning or (f"connected; {exchanges}" if exchanges else "")
-            return PortReport(
+            return port.PortReport(
                 self.device, hardware, next(filter(None, problems), ""), warning, "connected", values
             )
 
     def _opened(self, now_ns: int) -> list[Any]:
-        self._other_users = ", ".join(processes_using(self.device))
+        self._other_users = ", ".join(port.processes_using(self.device))
         self._connections = self.session.counts["connections"]
         return self._observed(self.session.opened(now_ns))
 
@@ -212,9 +189,9 @@ class BoardPort(StreamPort):
             case RadioConfigured(settings=settings):
                 # A board may repeat its settings.
                 if settings != self._radio:
-                    text = f"the board's radio {format_id(settings.address)}: {settings_text(settings)}"
+                    text = f"the board's radio {format_id(settings.address)}: {settings.text}"
                 self._radio = settings
-            case events.Refused(problem=problem, text=reason):
+            case Refused(problem=problem, text=reason):
                 self._refused[problem] = reason
                 level, text = logging.ERROR, f"{problem}: {reason}"
             case Hello():
@@ -233,4 +210,4 @@ class BoardPort(StreamPort):
         return PortMessage(level, text) if text else None
 
 
-open = stream_opener(BoardPort)
+open = port.stream_opener(BoardPort)

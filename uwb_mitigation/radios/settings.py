@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import enum
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from pathlib import Path
-from typing import Any
+from typing import ClassVar
 
-from uwb_mitigation.errors import ParameterError, format_id, parse_id
-
-ValueReader = Callable[[str], Any]
-"""Returns the value of a parameter of the driver."""
+from uwb_mitigation.errors import ParameterError, format_id
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,10 +17,6 @@ class PortMessage:
 
     level: int
     text: str
-
-
-PREFIX = "radio."
-"""Prefix of the parameters of radios."""
 
 
 class Role(enum.IntEnum):
@@ -116,6 +107,14 @@ class RadioSettings:
         for anchor in self.anchors:
             _within("anchors", anchor, 1, 2**64 - 2)
 
+    @property
+    def text(self) -> str:
+        """The settings as text for the log."""
+        return (
+            f"{self.role.name.lower()}, channel {self.channel}, {self.rate_kbps} kbit/s, preamble {self.preamble}, "
+            f"PAN 0x{self.pan:04x}"
+        )
+
 
 DEFAULT_RADIO = RadioSettings()
 
@@ -133,7 +132,20 @@ class AnchorStatus:
 
 @dataclass(frozen=True, slots=True)
 class RadioStatus:
-    """State, and counts since the board's start; the fields of `layout.PAYLOADS[RADIO_STATUS]`."""
+    """State, and counts since the board's start; the fields of `layout.PAYLOADS[RADIO_STATUS]`.
+
+    Attributes:
+        REMEDIES: {cause of a failed exchange: what to do}; the causes are the names of counts.
+    """
+
+    REMEDIES: ClassVar[Mapping[str, str]] = {
+        "no answer": "no anchor answers: check their power, channel, data rate and PAN id",
+        "late": "this computer is too slow for radio.reply_us: stop other programs",
+        "timeout": "the frames of the anchors do not arrive in time: all radios need the same firmware and settings",
+        "damaged": "damaged frames: other radios transmit on this channel, or the signal is weak",
+        "implausible": "the antennas are too close, or the antenna delays are wrong",
+        "broken": "the radio was reset or its bus failed: check supply and wiring",
+    }
 
     tried: int = 0
     ranged: int = 0
@@ -150,143 +162,44 @@ class RadioStatus:
     state: RadioState = RadioState.RUNNING
     anchors: tuple[AnchorStatus, ...] = ()
 
+    @property
+    def problem(self) -> str:
+        """Why the radio does not work; empty if it does, or may."""
+        return _STATE_PROBLEMS.get(self.state, "")
 
-STATE_PROBLEMS = {
+    @property
+    def warning(self) -> str:
+        """The warning of a radio whose state is not certain; empty if it is."""
+        if self.state is RadioState.LOCK_UNCONFIRMED:
+            return "the DW1000 has not reported that its clock PLL locked; if it does not range, check its supply"
+        return ""
+
+    def values(self, settings: RadioSettings | None, prefix: str = "") -> dict[str, object]:
+        """Return the values of a radio and of its anchors for the diagnostics."""
+        values: dict[str, object] = {}
+        if settings is not None:
+            values = {
+                "address": format_id(settings.address),
+                "role": settings.role.name.lower(),
+                "antenna delay": settings.antenna_delay,
+            }
+        counts = (row.name for row in fields(RadioStatus) if row.type == "int")
+        values |= {name.replace("_", " "): getattr(self, name) for name in counts}
+        values |= {"temperature C": f"{self.temperature_c:.1f}", "voltage V": f"{self.voltage:.2f}"}
+        values = {f"{prefix}{name}": value for name, value in values.items()}
+        for anchor in self.anchors:
+            last_seen = "never" if anchor.age_ms == AGE_UNKNOWN_MS else f"{anchor.age_ms / 1000:.1f} s ago"
+            values[f"anchor {format_id(anchor.address)}"] = (
+                f"{anchor.ranged} of {anchor.tried} ranged, {anchor.rx_power_dbm:.1f} dBm, last seen {last_seen}"
+            )
+        return values
+
+
+_STATE_PROBLEMS = {
     RadioState.ABSENT: "no DW1000 answers: check wiring and supply",
     RadioState.BUS: "the SPI of the DW1000 fails",
     RadioState.NO_CLOCK: "the clock PLL of the DW1000 does not lock: check its supply",
 }
-
-EXCHANGE_REMEDIES = {
-    "no answer": "no anchor answers: check their power, channel, data rate and PAN id",
-    "late": "this computer is too slow for radio.reply_us: stop other programs",
-    "timeout": "the frames of the anchors do not arrive in time: all radios need the same firmware and settings",
-    "damaged": "damaged frames: other radios transmit on this channel, or the signal is weak",
-    "implausible": "the antennas are too close, or the antenna delays are wrong",
-    "broken": "the radio was reset or its bus failed: check supply and wiring",
-}
-"""{cause of a failed exchange: what to do}; the causes are the names of counts of `RadioStatus`."""
-
-
-def read_ports(value: ValueReader) -> list[str]:
-    """Return the ports of the parameter `port`.
-
-    Raises:
-        ParameterError: it is empty.
-    """
-    ports = [text.strip() for text in value("port").split(",") if text.strip()]
-    if not ports:
-        valid = "/dev/ttyACM0 or usb:VENDOR:PRODUCT[:SERIAL], or several with commas"
-        if value("source") == "spi":
-            valid = "/dev/spidevBUS.SELECT, or several with commas"
-        raise ParameterError("parameter port is empty", valid=valid)
-    return ports
-
-
-def read_capture(value: ValueReader) -> Path | None:
-    """Return the parameter `capture`; None = none."""
-    path = value("capture")
-    return Path(path).expanduser() if path else None
-
-
-def read_baud(value: ValueReader, default: int) -> int:
-    """Return the parameter `baud`, or a default for 0; raise ParameterError if it is too small."""
-    if 0 < (baud := int(value("baud"))) < 1200:
-        raise ParameterError(f"parameter baud = {baud}", valid="0, or 1200 to 12000000")
-    return baud or default
-
-
-def read_addresses(value: ValueReader, name: str, highest: int = 2**64 - 2) -> tuple[int, ...]:
-    """Return the addresses of the parameter `radio.NAME`: a number, a text with commas, or an array.
-
-    Raises:
-        ParameterError: one of them is not an address.
-    """
-    content = value(PREFIX + name)
-    texts = content.strip(" []").split(",") if isinstance(content, str) else content
-    texts = texts if isinstance(texts, Iterable) else [texts]
-    addresses = []
-    for text in filter(None, (str(item).strip() for item in texts)):
-        address = 0
-        with contextlib.suppress(ValueError):
-            address = parse_id(text)
-        if not 0 < address <= highest:
-            what, valid = f"parameter {PREFIX}{name} = {text!r:.40}", "1 to 65534"
-            if highest > 0xFFFE:
-                valid = "a number below 65536, or 0x and up to 16 hexadecimal digits"
-            raise ParameterError(what, valid=f"{valid}; several with commas")
-        addresses.append(address)
-    return tuple(addresses)
-
-
-def read_radio(value: ValueReader) -> RadioSettings:
-    """Return the settings of a DW1000 from the parameters `radio.*`.
-
-    Raises:
-        ParameterError: a setting is invalid; names the parameter.
-    """
-    names = {"prf_mhz": "prf", "rate_kbps": "data_rate"}
-    computed = ("role", "address", "anchors", "channel", "interval_us", "reply_us", "timeout_us")
-    settings = {
-        row.name: value(PREFIX + names.get(row.name, row.name))
-        for row in fields(RadioSettings)
-        if row.name not in computed
-    }
-    rate_hz = value(PREFIX + "rate")
-    radio = RadioSettings(
-        role=Role[value(PREFIX + "role").upper()],
-        address=(*read_addresses(value, "address"), 0)[0],
-        anchors=read_addresses(value, "anchors"),
-        channel=value(PREFIX + "channel") or DEFAULT_RADIO.channel,
-        interval_us=round(1e6 / rate_hz) if rate_hz else 0,
-        **settings,
-    )
-    check_parameters(radio)
-    return radio
-
-
-def check_parameters(settings: Any) -> None:
-    """Check settings that were read from the parameters `radio.*`; raise ParameterError, with their name."""
-    try:
-        settings.check()
-    except ParameterError as error:
-        raise ParameterError(f"parameters {PREFIX}*: {error.what}", valid=error.valid) from error
-
-
-def settings_text(settings: RadioSettings) -> str:
-    """Return the settings as text for the log."""
-    return (
-        f"{settings.role.name.lower()}, channel {settings.channel}, {settings.rate_kbps} kbit/s, preamble "
-        f"{settings.preamble}, PAN 0x{settings.pan:04x}"
-    )
-
-
-def status_warning(status: RadioStatus) -> str:
-    """Return the warning of a radio whose state is not certain; empty if it is."""
-    if status.state is RadioState.LOCK_UNCONFIRMED:
-        return "the DW1000 has not reported that its clock PLL locked; if it does not range, check its supply"
-    return ""
-
-
-def radio_values(settings: RadioSettings | None, status: RadioStatus, prefix: str = "") -> dict[str, object]:
-    """Return the values of a radio and of its anchors for the diagnostics."""
-    values: dict[str, object] = {}
-    if settings is not None:
-        values = {
-            "address": format_id(settings.address),
-            "role": settings.role.name.lower(),
-            "antenna delay": settings.antenna_delay,
-        }
-    counts = (row.name for row in fields(RadioStatus) if row.type == "int")
-    values |= {name.replace("_", " "): getattr(status, name) for name in counts}
-    values |= {"temperature C": f"{status.temperature_c:.1f}", "voltage V": f"{status.voltage:.2f}"}
-    values = {f"{prefix}{name}": value for name, value in values.items()}
-    for anchor in status.anchors:
-        last_seen = "never" if anchor.age_ms == AGE_UNKNOWN_MS else f"{anchor.age_ms / 1000:.1f} s ago"
-        values[f"anchor {format_id(anchor.address)}"] = (
-            f"{anchor.ranged} of {anchor.tried} ranged, {anchor.rx_power_dbm:.1f} dBm, last seen {last_seen}"
-        )
-    return values
 
 
 def preamble_codes(channel: int, prf_mhz: int) -> range:

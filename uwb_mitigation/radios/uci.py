@@ -9,29 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from uwb_mitigation.errors import LinkError, ParameterError, format_id
+from uwb_mitigation.radios import parameters, port
 from uwb_mitigation.radios.capture import Capture
 from uwb_mitigation.radios.fira.calibration import OriginalsFile
 from uwb_mitigation.radios.fira.codes import EXCHANGE_REMEDIES, UNEXPECTED_CAUSES
 from uwb_mitigation.radios.fira.session import UciSession, UciSettings
-from uwb_mitigation.radios.port import (
-    ExchangeMonitor,
-    PortAddress,
-    PortReport,
-    StreamPlace,
-    StreamPort,
-    StreamSettings,
-    stream_opener,
-)
-from uwb_mitigation.radios.settings import (
-    PREFIX,
-    PortMessage,
-    Role,
-    ValueReader,
-    check_parameters,
-    read_addresses,
-    read_capture,
-    read_ports,
-)
+from uwb_mitigation.radios.settings import PortMessage, Role
 
 DEFAULT_CHANNEL = 9
 """The channel of the configuration that is known from a real board."""
@@ -48,48 +31,50 @@ _REJECTED = "ranging without the parameters that the board rejected"
 
 
 @dataclass(frozen=True)
-class UciPortSettings(StreamSettings):
+class UciPortSettings(port.StreamSettings):
     """Settings of a UCI board; `board`: what it does."""
 
     board: UciSettings
 
 
-def read_settings(value: ValueReader) -> list[UciPortSettings]:
+def read_settings(value: parameters.ValueReader) -> list[UciPortSettings]:
     """Return the settings of the boards at `port`. The first has the role of the parameter, the others are anchors.
 
     Raises:
         ParameterError: a setting is invalid; names the parameter.
     """
-    ports = [PortAddress.parse(port) for port in read_ports(value)]
-    is_tag = value(PREFIX + "role") == "tag"
-    address = (*read_addresses(value, "address", 0xFFFE), 1 if is_tag else 2)[0]
+    ports = [port.PortAddress.parse(text) for text in parameters.read_ports(value)]
+    is_tag = value("radio.role") == "tag"
+    address = (*parameters.read_addresses(value, "address", 0xFFFE), 1 if is_tag else 2)[0]
     local_anchors = tuple(address + number for number in range(1, len(ports)))
     if local_anchors and not is_tag:
         raise ParameterError("several ports and radio.role = anchor", valid="one port, or radio.role = tag")
-    anchors = read_addresses(value, "anchors", 0xFFFE) or local_anchors or (2,)
-    tags = read_addresses(value, "tags", 0xFFFE) or (1,)
+    anchors = parameters.read_addresses(value, "anchors", 0xFFFE) or local_anchors or (2,)
+    tags = parameters.read_addresses(value, "tags", 0xFFFE) or (1,)
     peers = anchors if is_tag else tags
-    rate_hz = value(PREFIX + "rate")
+    rate_hz = value("radio.rate")
     first = UciSettings(
         role=Role.TAG if is_tag else Role.ANCHOR,
         address=address,
         peers=peers,
-        channel=value(PREFIX + "channel") or DEFAULT_CHANNEL,
-        preamble_code=value(PREFIX + "preamble_code"),
-        window=value(PREFIX + "window"),
+        channel=value("radio.channel") or DEFAULT_CHANNEL,
+        preamble_code=value("radio.preamble_code"),
+        window=value("radio.window"),
         interval_ms=round(1000 * len(peers) / rate_hz) if rate_hz else 0,
-        report=value(PREFIX + "report"),
+        report=value("radio.report"),
         sessions=len(peers),
     )
     anchor = replace(first, role=Role.ANCHOR, peers=(address,))
     boards = [first, *(replace(anchor, address=local) for local in local_anchors)]
     for board in boards:
-        check_parameters(board)
-    capture = read_capture(value)
-    return [UciPortSettings(port, board, capture=capture) for port, board in zip(ports, boards, strict=True)]
+        parameters.check_parameters(board)
+    capture = parameters.read_capture(value)
+    return [
+        UciPortSettings(address, board, capture=capture) for address, board in zip(ports, boards, strict=True)
+    ]
 
 
-def open_capture(path: Path, value: ValueReader | None = None) -> Capture:
+def open_capture(path: Path, value: parameters.ValueReader | None = None) -> Capture:
     """Open a capture as a recording; raise RecordingError if it cannot be read."""
 
     def session(settings: dict[str, Any]) -> UciSession:
@@ -100,7 +85,7 @@ def open_capture(path: Path, value: ValueReader | None = None) -> Capture:
     return Capture(path, "UCI", session)
 
 
-class UciPort(StreamPort):
+class UciPort(port.StreamPort):
     """Operates one board until `close`; starts it again after a loss. See `StreamPort`.
 
     Events are measurements and `PortMessage`; an anchor delivers its measurements only if its settings request it.
@@ -109,10 +94,10 @@ class UciPort(StreamPort):
     session: UciSession
     _tick_s = 0.01
 
-    def __init__(self, settings: UciPortSettings, place: StreamPlace) -> None:
+    def __init__(self, settings: UciPortSettings, place: port.StreamPlace) -> None:
         self._originals = OriginalsFile(str(settings.address))
         session = UciSession(settings.board, self._originals)
-        super().__init__(settings, session, ExchangeMonitor(EXCHANGE_REMEDIES, UNEXPECTED_CAUSES), place)
+        super().__init__(settings, session, port.ExchangeMonitor(EXCHANGE_REMEDIES, UNEXPECTED_CAUSES), place)
         self._starts = 0
         self._worked_ns = self._stop_ns = 0
 
@@ -140,7 +125,7 @@ class UciPort(StreamPort):
         with self._lock:
             return self._lost or self.session.state
 
-    def report(self) -> PortReport:
+    def report(self) -> port.PortReport:
         """Return the present state."""
         with self._lock:
             session, s = self.session, self.session.settings
@@ -161,7 +146,7 @@ class UciPort(StreamPort):
             activity = "ranging" if s.role is Role.TAG else "answering"
             warnings = self._warning(), rejected and f"{_REJECTED}: {rejected}"
             warning = "; ".join(filter(None, warnings))
-            return PortReport(self.device, hardware, self.problem, warning, activity, values)
+            return port.PortReport(self.device, hardware, self.problem, warning, activity, values)
 
     def _warning(self) -> str:
         """Return a possible reason why a board without a problem has no useful ranges, or an empty string."""
@@ -230,4 +215,4 @@ class UciPort(StreamPort):
         )
 
 
-open = stream_opener(UciPort, "UCI")
+open = port.stream_opener(UciPort, "UCI")

@@ -42,8 +42,7 @@ class AntennaPairs:
     @property
     def distance_m(self) -> NDArray[np.float64]:
         """Straight-line distances, (n,)."""
-        distance: NDArray[np.float64] = np.hypot(*(self.tag - self.anchor).T)
-        return distance
+        return np.asarray(np.hypot(*(self.tag - self.anchor).T), np.float64)
 
     def take(self, fields: NDArray[np.intp], field_of: NDArray[np.intp]) -> AntennaPairs:
         """Return pairs over some of the fields, with new row numbers in `field_of`; field k is that of link k here."""

@@ -289,8 +289,7 @@ def mean_level_dbm(
 ) -> NDArray[np.float64]:
     """Return the mean receive level, dBm (n,), from `mean_powers_db`."""
     power = 10.0 ** (direct_db / 10.0) + 10.0 ** (diffuse_db / 10.0)
-    level: NDArray[np.float64] = radio.sent_dbm + boards.gain_db + 10.0 * np.log10(power)
-    return level
+    return radio.sent_dbm + boards.gain_db + 10.0 * np.log10(power)
 
 
 def mean_powers_db(
@@ -314,5 +313,4 @@ def _balanced(conditions: NDArray[np.int64], count: int, rng: np.random.Generato
     for condition in (LOS, NLOS, NDP_NLOS, WEAK):
         rows = order[conditions[order] == condition]
         turn[rows] = np.arange(len(rows)) + (len(conditions) if condition == WEAK else 0)
-    chosen: NDArray[np.intp] = np.sort(order[np.argsort(turn[order], kind="stable")][:count])
-    return chosen
+    return np.sort(order[np.argsort(turn[order], kind="stable")][:count])

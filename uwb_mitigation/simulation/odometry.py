@@ -141,8 +141,7 @@ def yaw_along_route(route: tuple[Point, ...], travelled_m: NDArray[np.float64]) 
         )
 
     half = _CORNER_M / 2.0
-    mean: NDArray[np.float64] = (integrated(travelled_m + half) - integrated(travelled_m - half)) / _CORNER_M
-    return mean
+    return (integrated(travelled_m + half) - integrated(travelled_m - half)) / _CORNER_M
 
 
 def _slips(n: int, rng: np.random.Generator) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:

@@ -194,8 +194,7 @@ class Receiver:
     def compression(self, power: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the amplitude gain of frames with the given power (sum of squares for each symbol squared)."""
         limit = 10.0 ** ((self.compression_dbm + POWER_CONSTANT_DB) / 20.0)
-        gain: NDArray[np.float64] = (1.0 + (np.sqrt(power) / limit) ** 1.5) ** (-1.0 / 1.5)
-        return gain
+        return np.asarray((1.0 + (np.sqrt(power) / limit) ** 1.5) ** (-1.0 / 1.5), np.float64)
 
     def direct_margin_db(
         self, direct_db: NDArray[np.float64], diffuse_db: NDArray[np.float64], boards: Boards
@@ -223,8 +222,7 @@ class Receiver:
         if self.pulses_per_symbol:
             side_lobes = self.pulse_peak**2 * strongest / (self.pulses_per_symbol * np.maximum(count, 1.0))
             threshold = np.maximum(threshold, SIDE_LOBE_SIGMAS**2 * side_lobes)
-        margin: NDArray[np.float64] = 10.0 * np.log10(self.pulse_peak**2 * direct / threshold)
-        return margin
+        return 10.0 * np.log10(self.pulse_peak**2 * direct / threshold)
 
     def receive(
         self, multipath: Multipath, rng: np.random.Generator, boards: Boards | None = None
@@ -344,8 +342,7 @@ def place_paths(
 def noise_threshold(magnitude: NDArray[np.float32], multiplier: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return LDE_THRESH of (n, TAPS) magnitudes: the noise's standard deviation times NTM, at least 1."""
     deviation = magnitude[:, NOISE_TAPS].std(axis=1)
-    threshold: NDArray[np.int64] = np.clip(np.rint(multiplier * deviation), 1, 65535).astype(np.int64)
-    return threshold
+    return np.asarray(np.clip(np.rint(multiplier * deviation), 1, 65535), np.int64)
 
 
 def detect_first_path(
@@ -378,8 +375,7 @@ def detect_first_path(
     fraction = np.clip((half - low) / rise, 0.0, 1.0)
     index = crossing + _FINE_TAPS[last] + fraction / _EDGE_STEPS
     index = np.rint(index * INDEX_STEPS) / INDEX_STEPS
-    located: NDArray[np.float64] = np.where(is_found, index, np.nan)
-    return located
+    return np.where(is_found, index, np.nan)
 
 
 def power_levels(

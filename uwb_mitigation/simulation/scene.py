@@ -128,8 +128,7 @@ def knife_edge_loss_db(detour_m: NDArray[np.float64], channel: Channel) -> NDArr
     ITU-R P.526-15, section 4.1, with v = 2 sqrt(detour / wavelength).
     """
     v = 2.0 * np.sqrt(np.maximum(detour_m, 0.0) / channel.wavelength_m) - 0.1
-    loss: NDArray[np.float64] = 6.9 + 20.0 * np.log10(np.sqrt(v * v + 1.0) + v)
-    return loss
+    return 6.9 + 20.0 * np.log10(np.sqrt(v * v + 1.0) + v)
 
 
 def _crosses(a: NDArray[np.float64], b: NDArray[np.float64], p: Point, q: Point) -> NDArray[np.bool_]:
@@ -145,13 +144,11 @@ def _crosses(a: NDArray[np.float64], b: NDArray[np.float64], p: Point, q: Point)
 def _incidence_cosine(a: NDArray[np.float64], b: NDArray[np.float64], wall: Wall) -> NDArray[np.float64]:
     along, line = np.subtract(wall.end, wall.start), b - a
     length = np.maximum(np.hypot(line[:, 0], line[:, 1]), 1e-12) * math.hypot(*along)
-    cosine: NDArray[np.float64] = np.abs(line[:, 0] * along[1] - line[:, 1] * along[0]) / length
-    return cosine
+    return np.asarray(np.abs(line[:, 0] * along[1] - line[:, 1] * along[0]) / length, np.float64)
 
 
 def _detour(a: NDArray[np.float64], b: NDArray[np.float64], edge: Point) -> NDArray[np.float64]:
-    detour: NDArray[np.float64] = np.hypot(*(a - edge).T) + np.hypot(*(b - edge).T) - np.hypot(*(a - b).T)
-    return detour
+    return np.asarray(np.hypot(*(a - edge).T) + np.hypot(*(b - edge).T) - np.hypot(*(a - b).T), np.float64)
 
 
 FLAT = Building(

@@ -19,14 +19,7 @@ from uwb_mitigation.positioning.determination import UNIQUE
 from uwb_mitigation.positioning.geometry import horizontal_ellipse, parse_lever_arm
 from uwb_mitigation.recordings.bag.anchor_markers import parse_markers
 from uwb_mitigation.types.measurement import CorrectedRange, RangeMeasurement, Truth
-from uwb_mitigation.types.ros import topics
-from uwb_mitigation.types.ros.codec import (
-    MeasurementKey,
-    decode_corrected,
-    decode_range,
-    decode_truth,
-    measurement_key,
-)
+from uwb_mitigation.types.ros import codec, topics
 from uwb_mitigation.types.stamps import NS_PER_S, to_ns
 from uwb_mitigation.viewer.histories import BoundedDict, Pose, Sample, plausible_cir
 from uwb_mitigation.viewer.palette import TrackKind
@@ -36,9 +29,9 @@ MAX_WAITING, MAX_WITHOUT_TRUTH = 10_000, 1000
 """Truths and CIRs without corrected ranges, and corrected ranges without truths, that are kept."""
 
 DECODERS: dict[str, Callable[[bytes], Any]] = {
-    topics.RANGE_RAW: decode_range,
-    topics.RANGE_TRUTH: decode_truth,
-    topics.RANGE_CORRECTED: decode_corrected,
+    topics.RANGE_RAW: codec.decode_range,
+    topics.RANGE_TRUTH: codec.decode_truth,
+    topics.RANGE_CORRECTED: codec.decode_corrected,
 }
 
 LEVER_ARM = re.compile(r"tag (\S{1,20}) lever arm")
@@ -69,9 +62,9 @@ class SceneUpdater:
             topics.DIAGNOSTICS: lambda _, message: self._diagnostics(message),
         }
         # What waits for another message of its range.
-        self._truths: BoundedDict[MeasurementKey, Truth] = BoundedDict(MAX_WAITING)
-        self._levels: BoundedDict[MeasurementKey, tuple[float, float]] = BoundedDict(MAX_WAITING)
-        self._without_truth: BoundedDict[MeasurementKey, None] = BoundedDict(MAX_WITHOUT_TRUTH)
+        self._truths: BoundedDict[codec.MeasurementKey, Truth] = BoundedDict(MAX_WAITING)
+        self._levels: BoundedDict[codec.MeasurementKey, tuple[float, float]] = BoundedDict(MAX_WAITING)
+        self._without_truth: BoundedDict[codec.MeasurementKey, None] = BoundedDict(MAX_WITHOUT_TRUTH)
 
     def add_encoded(self, topic: str, data: bytes) -> None:
         """Decode and add a range."""
@@ -89,11 +82,11 @@ class SceneUpdater:
 
     def measurement(self, measurement: RangeMeasurement) -> None:
         levels = measurement.cir.power_gap_db, measurement.cir.rx_power_dbm
-        self._levels.add(measurement_key(measurement), levels)
+        self._levels.add(codec.measurement_key(measurement), levels)
         if (cir := plausible_cir(measurement.cir)) is not None:
             self.scene.set_cir((measurement.anchor_id, measurement.tag_id), cir)
 
-    def truth(self, key: MeasurementKey, truth: Truth) -> None:
+    def truth(self, key: codec.MeasurementKey, truth: Truth) -> None:
         if key in self._without_truth:
             del self._without_truth[key]
             pair = key.anchor_id, key.tag_id
@@ -101,7 +94,7 @@ class SceneUpdater:
         else:
             self._truths.add(key, truth)
 
-    def corrected(self, key: MeasurementKey, corrected: CorrectedRange) -> None:
+    def corrected(self, key: codec.MeasurementKey, corrected: CorrectedRange) -> None:
         truth = self._truths.pop(key, None)
         if truth is None and not self.scene.is_whole:
             self._without_truth.add(key, None)

@@ -27,15 +27,8 @@ from uwb_mitigation.recordings.bag.reader import BagReader, RawMessage, check_ch
 from uwb_mitigation.recordings.bag.writer import METADATA_RECORD, BagWriter
 from uwb_mitigation.types.measurement import RangeMeasurement, Status, reason
 from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets
-from uwb_mitigation.types.ros import schemas
+from uwb_mitigation.types.ros import schemas, topics
 from uwb_mitigation.types.ros.codec import RangeBatch, decode_range, encode_corrected
-from uwb_mitigation.types.ros.topics import (
-    ANCHORS,
-    RANGE_CIR_TYPE,
-    RANGE_CORRECTED,
-    RANGE_CORRECTED_TYPE,
-    RANGE_RAW,
-)
 
 BATCH = 256
 """Messages per batch: large enough for vectorisation, small enough for the network's inputs to fit into the cache."""
@@ -133,7 +126,7 @@ def process_bag(job: Job, report: Report | None = None) -> Outcome:
     outcome = Outcome(job, models=mitigation.used, written=True)
     with BagWriter(job.output, origin, force=job.force) as out:
         corrector = _Corrector(outcome, mitigation, out)
-        if ANCHORS not in bag.topics and bag.bounds_ns and (anchors := recorded_anchors(job.source)):
+        if topics.ANCHORS not in bag.topics and bag.bounds_ns and (anchors := recorded_anchors(job.source)):
             write_anchors(out, anchors, bag.bounds_ns[0])
         messages = bag.messages()
         while outcome.error is None:
@@ -152,7 +145,7 @@ def process_bag(job: Job, report: Report | None = None) -> Outcome:
                 report(outcome.messages, bag.message_count)
         if outcome.error is not None and outcome.messages == 0:
             raise outcome.error
-        bag.require(RANGE_RAW)
+        bag.require(topics.RANGE_RAW)
     outcome.seconds = time.perf_counter() - started
     outcome.ranges = outcome.statuses.total()
     outcome.skipped.update(bag.warnings)
@@ -166,25 +159,25 @@ class _Corrector:
         self._outcome, self._mitigation, self._out = outcome, mitigation, out
         # The bag keeps references to its channels, so that an id() identifies one channel of one file.
         self._channels: dict[int, int] = {}
-        self._corrected = out.channel(RANGE_CORRECTED, RANGE_CORRECTED_TYPE)
+        self._corrected = out.channel(topics.RANGE_CORRECTED, topics.RANGE_CORRECTED_TYPE)
 
     def write(self, batch: list[RawMessage]) -> None:
         """Write the messages of a batch, and after each raw range its corrected range."""
         channels, out = self._channels, self._out
-        raw = [message for message in batch if message.channel.topic == RANGE_RAW]
+        raw = [message for message in batch if message.channel.topic == topics.RANGE_RAW]
         for channel in {id(message.channel): message.channel for message in raw}.values():
             if id(channel) not in channels:
-                check_channel(channel, RANGE_CIR_TYPE, self._outcome.job.source)
+                check_channel(channel, topics.RANGE_CIR_TYPE, self._outcome.job.source)
                 channels[id(channel)] = out.copy_channel(channel)
         corrected = iter(self._correct([message.data for message in raw]))
         for channel, sequence, log_ns, publish_ns, data in batch:
-            if channel.topic == RANGE_CORRECTED:
+            if channel.topic == topics.RANGE_CORRECTED:
                 self._outcome.replaced += 1
                 continue
             if id(channel) not in channels:
                 channels[id(channel)] = out.copy_channel(channel)
             out.write_serialized(channels[id(channel)], data, log_ns, publish_ns, sequence)
-            if channel.topic == RANGE_RAW and (message := next(corrected)) is not None:
+            if channel.topic == topics.RANGE_RAW and (message := next(corrected)) is not None:
                 out.write_serialized(self._corrected, message, log_ns, publish_ns, sequence)
 
     def _correct(self, messages: list[bytes]) -> list[bytes | None]:

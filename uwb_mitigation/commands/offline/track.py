@@ -23,14 +23,7 @@ from uwb_mitigation.recordings.bag.pose_paths import read_heights, read_lever_ar
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.offsets import NO_OFFSETS
-from uwb_mitigation.types.ros.poses import (
-    BodyTwist,
-    encode_odometry,
-    encode_pose,
-    encode_true_position,
-    tag_frame,
-    tag_topic,
-)
+from uwb_mitigation.types.ros import poses
 from uwb_mitigation.types.ros.topics import ODOMETRY, ODOMETRY_TRUTH, ODOMETRY_TYPE, POSE_SMOOTHED, POSE_TYPE
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Estimate, Ranges, Track, TruePath
@@ -206,27 +199,27 @@ def write_tracks(bag: BagWriter, tracks: list[TagTracks]) -> None:
 
 def _messages(tracks: TagTracks, several: bool) -> Iterator[tuple[int, str, str, bytes]]:
     tag = tracks.recording.tag_id
-    name, frame = (tag if several else None), tag_frame(tag)
+    name, frame = (tag if several else None), poses.tag_frame(tag)
     for estimate in tracks.live:
-        data = encode_odometry(estimate, child_frame_id=frame, twist=_body_twist(estimate))
-        yield estimate.stamp_ns, tag_topic(ODOMETRY, name), ODOMETRY_TYPE, data
+        data = poses.encode_odometry(estimate, child_frame_id=frame, twist=_body_twist(estimate))
+        yield estimate.stamp_ns, poses.tag_topic(ODOMETRY, name), ODOMETRY_TYPE, data
     for estimate in tracks.smoothed:
-        yield estimate.stamp_ns, tag_topic(POSE_SMOOTHED, name), POSE_TYPE, encode_pose(estimate)
+        yield estimate.stamp_ns, poses.tag_topic(POSE_SMOOTHED, name), POSE_TYPE, poses.encode_pose(estimate)
     truth = tracks.recording.truth
     yaws = truth.yaw_at(truth.stamp_ns).tolist()
     for stamp, position, yaw in zip(truth.stamp_ns.tolist(), truth.position.tolist(), yaws, strict=True):
-        data = encode_true_position(position, tag, stamp, yaw if np.isfinite(yaw) else None)
+        data = poses.encode_true_position(position, tag, stamp, yaw if np.isfinite(yaw) else None)
         yield stamp, ODOMETRY_TRUTH, ODOMETRY_TYPE, data
 
 
-def _body_twist(estimate: Estimate) -> BodyTwist | None:
+def _body_twist(estimate: Estimate) -> poses.BodyTwist | None:
     """Return the velocity in the axes of the robot; None: its heading is unknown."""
     if estimate.heading is None:
         return None
     cosine, sine = np.cos(estimate.heading.yaw), np.sin(estimate.heading.yaw)
     vx, vy, _ = estimate.velocity.tolist()
     variance = float(estimate.covariance[[3, 4], [3, 4]].max())
-    return BodyTwist(cosine * vx + sine * vy, cosine * vy - sine * vx, speed_variance=variance)
+    return poses.BodyTwist(cosine * vx + sine * vy, cosine * vy - sine * vx, speed_variance=variance)
 
 
 def tum(track: Track) -> str:
@@ -240,4 +233,4 @@ def tum(track: Track) -> str:
 
 def tum_file(path: Path, tag_id: int, several: bool) -> Path:
     """Return the path of a tag's TUM file: `path`, with the tag's number in the name if there are several tags."""
-    return path.with_name(f"{path.stem}.{tag_frame(tag_id)}{path.suffix}") if several else path
+    return path.with_name(f"{path.stem}.{poses.tag_frame(tag_id)}{path.suffix}") if several else path

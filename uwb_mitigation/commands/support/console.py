@@ -166,16 +166,18 @@ def stage_bars() -> Iterator[Callable[[str, float | None], None]]:
 
 
 @contextlib.contextmanager
-def reading() -> Iterator[Callable[[], None]]:
-    """Show a progress bar of unknown length; yield a function to call after each range."""
+def counting(name: str = "reading", total: int | None = None) -> Iterator[Callable[..., Iterator[Any]]]:
+    """Show a progress bar of records; yield a function that passes records on and counts them."""
     with progress() as bar:
-        task, ranges = bar.add_task("reading", total=None), itertools.count(1)
+        task, numbers = bar.add_task(name, total=total), itertools.count(1)
 
-        def on_record() -> None:
-            if (count := next(ranges)) % 100 == 0:
-                bar.update(task, description=f"reading: {count} ranges")
+        def counted(records: Iterable[Any]) -> Iterator[Any]:
+            for record in records:
+                if (count := next(numbers)) % 100 == 0:
+                    bar.update(task, completed=count, description=f"{name}: {count} ranges")
+                yield record
 
-        yield on_record
+        yield counted
 
 
 def show_skipped(skipped: Mapping[str, int]) -> None:

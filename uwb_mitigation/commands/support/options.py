@@ -16,40 +16,52 @@ if TYPE_CHECKING:
     from uwb_mitigation.positioning.track_settings import TrackSettings
 
 ScalingName = Literal["preamble", "max"]
+
+
+def option(text: str, *names: str, **details: Any) -> Any:
+    """Return an option with its help text; `details` are those of `typer.Option`."""
+    return typer.Option(*names, help=text, **details)
+
+
+def argument(metavar: str, text: str) -> Any:
+    """Return an argument without a name, which stands for itself in the help."""
+    return typer.Argument(metavar=metavar, help=text)
+
+
+def output_option(metavar: str, text: str) -> Any:
+    """Return the option `-o` for what a command writes."""
+    return option(text, "-o", "--output", metavar=metavar)
+
+
 """Values of `Scaling`, which takes long to import."""
 
 OffsetsOption = Annotated[
     str | None,
-    typer.Option(
+    option(
+        "Range offsets of the radios due to antenna delays: metres, or a file written by `uwb-mitigation offset`.",
         "--offsets",
         metavar="M|FILE",
-        help="Range offsets of the radios due to antenna delays: metres, or a file written by `uwb-mitigation offset`.",
     ),
 ]
 
 ModelOption = Annotated[
     Path | None,
-    typer.Option(
+    option(
+        "Bundle, or the name of a shipped one. Default: `auto`, the shipped model that fits the radio and the CIR.",
         metavar="FILE|NAME",
-        help="Bundle, or the name of a shipped one. Default: `auto`, the shipped model that fits the radio and the CIR.",
         show_default=False,
     ),
 ]
 
 AnchorsOption = Annotated[
     Path | None,
-    typer.Option(
+    option(
+        "YAML file of the anchors: `anchors: [{id: 1, x: 0.0, y: 0.0, z: 2.1}]`. Default: X.anchors.yaml next to the first "
+        "BAG X.mcap.",
         "--anchors",
         metavar="FILE",
-        help="YAML file of the anchors: `anchors: [{id: 1, x: 0.0, y: 0.0, z: 2.1}]`. Default: X.anchors.yaml next to the first "
-        "BAG X.mcap.",
     ),
 ]
-
-
-def output_option(metavar: str, description: str) -> Any:
-    """Return the option `-o` for what a command writes."""
-    return typer.Option("-o", "--output", metavar=metavar, help=description)
 
 
 def check_replaceable(files: Iterable[Path], force: bool) -> None:
@@ -73,7 +85,7 @@ def check_output(output: Path, force: bool = True, suffix: str = ".onnx") -> Non
 
 def _option(default: Any, kind: Any, metavar: str | None, text: str) -> tuple[Any, Any]:
     """Return the default and the annotation of an option."""
-    return default, Annotated[kind, typer.Option(metavar=metavar, help=text)]
+    return default, Annotated[kind, option(text, metavar=metavar)]
 
 
 OPTIONS: dict[str, tuple[Any, Any]] = {

@@ -12,14 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ModelError
+from uwb_mitigation.mitigation.model import requantisation
 from uwb_mitigation.mitigation.model.architecture import HEAD, Mlp, Remnet
-from uwb_mitigation.mitigation.model.requantisation import (
-    Sum,
-    accumulator_range,
-    requantisation_scale,
-    solve_requantisation,
-    solve_sum,
-)
 from uwb_mitigation.mitigation.model.weights import Int8Weights, inputs_of
 
 FILTERS = 16
@@ -48,11 +42,11 @@ class PackedModule:
 
     residual_weights: NDArray[np.int32]
     residual: Channels
-    residual_sum: Sum
+    residual_sum: requantisation.Sum
     reduce_weights: NDArray[np.int16]
     reduce: Channels
     skip: Channels
-    output_sum: Sum
+    output_sum: requantisation.Sum
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,8 +100,10 @@ def _packed_convolutions(weights: Int8Weights, shape: Remnet) -> dict[str, Any]:
     _check_shape(shape)
     scale, inputs = weights.activation_scale, inputs_of(shape)
 
-    def total(name: str) -> Sum:
-        exact = solve_sum(*(np.float32(scale[operand] / scale[name]) for operand in inputs[name]))
+    def total(name: str) -> requantisation.Sum:
+        exact = requantisation.solve_sum(
+            *(np.float32(scale[operand] / scale[name]) for operand in inputs[name])
+        )
         if exact is None:
             raise ModelError("the sum has no exact integer form", where=name, valid=_REMEDY)
         return exact
@@ -180,11 +176,13 @@ def _channels(weights: Int8Weights, name: str) -> Channels:
     """Return the requantisation of a layer; raises ModelError if it has no exact integer form."""
     scale, bias = weights.activation_scale, weights.bias[name]
     (read,) = inputs_of(weights.architecture)[name]
-    scales = requantisation_scale(scale[read], weights.weight_scale[name], scale[name])
-    low, high = accumulator_range(weights.weight[name], bias)
+    scales = requantisation.requantisation_scale(scale[read], weights.weight_scale[name], scale[name])
+    low, high = requantisation.accumulator_range(weights.weight[name], bias)
     constants = np.empty((3, len(bias)), np.int32)
     for channel, scale in enumerate(scales):
-        constant = solve_requantisation(scale, int(low[channel]), int(high[channel]), int(bias[channel]))
+        constant = requantisation.solve_requantisation(
+            scale, int(low[channel]), int(high[channel]), int(bias[channel])
+        )
         if constant is None:
             raise ModelError(
                 f"channel {channel} has no exact integer requantisation (scale {scale!r}, "
@@ -227,8 +225,7 @@ def _head_in_blocks(weight: NDArray[np.int8], shape: Remnet) -> NDArray[np.int8]
     length = shape.lengths[-1]
     blocks = -(-length // _BLOCK)
     padded = np.pad(weight[:, 0].reshape(FILTERS, length), ((0, 0), (0, -length % _BLOCK)))
-    in_words: NDArray[np.int8] = padded.reshape(FILTERS, blocks, _BLOCK)[..., _POSITION_ORDER].swapaxes(0, 1)
-    return in_words
+    return np.asarray(padded.reshape(FILTERS, blocks, _BLOCK)[..., _POSITION_ORDER].swapaxes(0, 1), np.int8)
 
 
 def _head_words(weight: NDArray[np.int8]) -> NDArray[np.int16]:
@@ -238,7 +235,7 @@ def _head_words(weight: NDArray[np.int8]) -> NDArray[np.int16]:
 
 
 def _head_bias(weight: NDArray[np.int8], bias: NDArray[np.int32]) -> int:
-    low, high = accumulator_range(weight, bias)
+    low, high = requantisation.accumulator_range(weight, bias)
     # Up to 2^23 the conversion to float is exact.
     if int(low[0]) < -(2**23) or int(high[0]) >= 2**23:
         raise ModelError(

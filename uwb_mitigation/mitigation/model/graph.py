@@ -62,8 +62,7 @@ class _Graph:
         )
         onnx.checker.check_model(model, full_check=True)
         # Deterministic bytes, so that the same training gives the same model id.
-        serialised: bytes = model.SerializeToString(deterministic=True)
-        return serialised
+        return bytes(model.SerializeToString(deterministic=True))
 
 
 def float_model(weights: FloatWeights) -> bytes:

@@ -12,13 +12,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from uwb_mitigation.mitigation.model import requantisation
 from uwb_mitigation.mitigation.model.architecture import HEAD
-from uwb_mitigation.mitigation.model.requantisation import (
-    requantisation_scale,
-    requantise,
-    saturate,
-    sum_table,
-)
 from uwb_mitigation.mitigation.model.weights import Int8Weights, evaluate, inputs_of, shaped, weighted_sums
 
 _BATCH = 256
@@ -49,7 +44,7 @@ class IntegerNetwork:
         architecture = self.weights.architecture
         with np.errstate(over="ignore"):  # An infinite quotient saturates like any large one.
             quotient = np.divide(inputs, self.weights.activation_scale["input"], dtype=np.float32)
-        first = shaped(architecture, saturate(np.rint(quotient)))
+        first = shaped(architecture, requantisation.saturate(np.rint(quotient)))
         return evaluate(architecture, first, self.apply, self.add)
 
     def apply(self, name: str, values: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -59,15 +54,15 @@ class IntegerNetwork:
             array.astype(float) for array in (values, self.weights.weight[name], self.weights.bias[name])
         )
         sums, scale = weighted_sums(self._layers[name], *exact), self.weights.activation_scale
-        factor = requantisation_scale(
+        factor = requantisation.requantisation_scale(
             scale[self._inputs[name][0]], self.weights.weight_scale[name], scale[name]
         )
-        return requantise(sums, factor.reshape(-1, *[1] * (sums.ndim - 2)))
+        return requantisation.requantise(sums, factor.reshape(-1, *[1] * (sums.ndim - 2)))
 
     def add(self, name: str, first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Compute the sum `name` of its two operands."""
         scale = self.weights.activation_scale
-        table = sum_table(*(scale[operand] / scale[name] for operand in self._inputs[name]))
+        table = requantisation.sum_table(*(scale[operand] / scale[name] for operand in self._inputs[name]))
         return table[first, second]
 
     def head(self, values: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -75,5 +70,4 @@ class IntegerNetwork:
         flat = values.reshape(len(values), -1).astype(np.int64)
         accumulator = flat @ self.weights.weight[HEAD].astype(np.int64) + self.weights.bias[HEAD]
         factor = self.weights.activation_scale[self._inputs[HEAD][0]] * self.weights.weight_scale[HEAD]
-        output: NDArray[np.float32] = accumulator[:, 0].astype(np.float32) * factor
-        return output
+        return np.asarray(accumulator[:, 0].astype(np.float32) * factor, np.float32)

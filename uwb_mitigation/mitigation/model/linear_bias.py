@@ -52,5 +52,4 @@ class LinearBiasModel:
         )
         gap = rx - first_path
         level = np.float32(self.offset_m) + np.float32(self.per_rx_power) * rx
-        predicted: NDArray[np.float32] = level + np.float32(self.per_power_gap) * gap
-        return predicted
+        return np.asarray(level + np.float32(self.per_power_gap) * gap, np.float32)

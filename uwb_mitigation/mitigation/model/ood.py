@@ -234,7 +234,6 @@ def _level_db(power: Values) -> Values:
         mantissas: Any
         mantissas, exponents = np.frexp(np.minimum(np.maximum(power, MIN_POWER), MAX_POWER))
         octaves = (_SQUARE * mantissas + _LINEAR) * mantissas - _CONSTANT
-        levels: NDArray[np.float32] = (exponents.astype(np.float32) + octaves) * _DB_PER_OCTAVE
-        return levels
+        return np.asarray((exponents.astype(np.float32) + octaves) * _DB_PER_OCTAVE, np.float32)
     mantissa, exponent = math.frexp(min(max(power, MIN_POWER), MAX_POWER))
     return (exponent + (_SQUARE * mantissa + _LINEAR) * mantissa - _CONSTANT) * _DB_PER_OCTAVE

@@ -128,8 +128,7 @@ def _thresholds(scale: np.float32, low: int, high: int) -> NDArray[np.int64]:
     candidates = np.clip(candidates, -(1 << 24), 1 << 24)
     reached = np.rint(candidates.astype(np.float32) * np.float32(scale)) >= steps[:, None]
     first = candidates[np.arange(_LEVELS), reached.argmax(axis=1)]
-    thresholds: NDArray[np.int64] = first[reached.any(axis=1) & (first > low) & (first <= high)]
-    return thresholds
+    return np.asarray(first[reached.any(axis=1) & (first > low) & (first <= high)], np.int64)
 
 
 def solve_requantisation(scale: np.float32, low: int, high: int, bias: int = 0) -> Requantisation | None:
@@ -300,5 +299,4 @@ def _neighbours(value: np.float32) -> Iterator[np.float32]:
 
 def saturate(values: NDArray[np.int64] | NDArray[np.float32]) -> NDArray[np.uint8]:
     """Return the values limited to 0 to 255, as uint8."""
-    clipped: NDArray[np.uint8] = np.clip(values, 0, _LEVELS).astype(np.uint8)
-    return clipped
+    return np.clip(values, 0, _LEVELS).astype(np.uint8)

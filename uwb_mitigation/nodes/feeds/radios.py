@@ -14,8 +14,9 @@ from typing import Any, Protocol
 from uwb_mitigation.nodes.feeds.publishing import RangePublisher
 from uwb_mitigation.nodes.support import diagnostics
 from uwb_mitigation.nodes.support.diagnostics import Description
+from uwb_mitigation.radios.parameters import ValueReader
 from uwb_mitigation.radios.port import OnEvent, RadioPort
-from uwb_mitigation.radios.settings import PortMessage, ValueReader
+from uwb_mitigation.radios.settings import PortMessage
 from uwb_mitigation.radios.wire.messages import Correction
 from uwb_mitigation.types.measurement import RangeMeasurement
 from uwb_mitigation.types.source import Source

@@ -13,14 +13,7 @@ from typing import Any
 import yaml
 
 from uwb_mitigation.errors import ParameterError, check_name
-from uwb_mitigation.nodes.support.parameter_tables import (
-    DAMAGED,
-    REFUSED,
-    RESPAWN_FOLDER,
-    TABLES,
-    Parameter,
-    ParameterValue,
-)
+from uwb_mitigation.nodes.support import parameter_tables as tables
 
 LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
 BOOLEANS = ("true", "false", "True", "False")
@@ -48,22 +41,22 @@ def on_exit(event: Any, context: object) -> list[Any]:
     from launch.events import matches_action
     from launch.events.process import ShutdownProcess
 
-    if event.returncode == REFUSED:
+    if event.returncode == tables.REFUSED:
         raise RuntimeError(f"{event.process_name} refused its start: see its error above")
-    if event.returncode in (0, DAMAGED):
+    if event.returncode in (0, tables.DAMAGED):
         return [EmitEvent(event=ShutdownProcess(process_matcher=matches_action(event.action)))]
     return []
 
 
-def arguments(nodes: Iterable[str]) -> dict[str, dict[str, Parameter]]:
+def arguments(nodes: Iterable[str]) -> dict[str, dict[str, tables.Parameter]]:
     """Return the arguments of a launch file, {argument: {node: parameter}}.
 
     An argument has the name of its parameter and applies to every node with that parameter. If parameters of
     one name differ in their defaults, they are different parameters: the later node's argument is NODE_PARAMETER.
     """
-    rows_by_argument: dict[str, dict[str, Parameter]] = {}
+    rows_by_argument: dict[str, dict[str, tables.Parameter]] = {}
     for node in nodes:
-        for row in TABLES[node]:
+        for row in tables.TABLES[node]:
             rows = rows_by_argument.setdefault(row.name, {})
             if any(earlier_row.default != row.default for earlier_row in rows.values()):
                 rows = rows_by_argument.setdefault(f"{node}_{row.name}", {})
@@ -71,7 +64,7 @@ def arguments(nodes: Iterable[str]) -> dict[str, dict[str, Parameter]]:
     return rows_by_argument
 
 
-def description(rows: Mapping[str, Parameter]) -> str:
+def description(rows: Mapping[str, tables.Parameter]) -> str:
     """Return the line of an argument for `--show-args`."""
     row = next(iter(rows.values()))
     default = "" if not row.filed else f" Default: {row.default_text}."
@@ -107,7 +100,7 @@ def parameters(
     return values
 
 
-def value_of(row: Parameter, text: str) -> ParameterValue:
+def value_of(row: tables.Parameter, text: str) -> tables.ParameterValue:
     """Return the value of a parameter from the text of an argument; a text of another type is left to the node."""
     try:
         if isinstance(row.default, bool):
@@ -156,7 +149,7 @@ def from_files(node: str, node_file: str, shared: str = "") -> dict[str, Any]:
     }
 
 
-def conflicting_parameters(node: str) -> dict[str, ParameterValue]:
+def conflicting_parameters(node: str) -> dict[str, tables.ParameterValue]:
     """Return the parameters whose names have another meaning for an earlier node, such as the viewer's port.
 
     In the section for all nodes of a shared file they belong to that earlier node, as arguments do.
@@ -164,7 +157,7 @@ def conflicting_parameters(node: str) -> dict[str, ParameterValue]:
     Returns:
         {parameter: default}
     """
-    node_rows = [(name, rows[node]) for name, rows in arguments(TABLES).items() if node in rows]
+    node_rows = [(name, rows[node]) for name, rows in arguments(tables.TABLES).items() if node in rows]
     return {row.name: row.default for name, row in node_rows if row.name != name}
 
 
@@ -194,7 +187,7 @@ def respawn_environment() -> dict[str, str]:
     """Return the environment that lets a respawned node continue with its parameters and state."""
     folder = tempfile.mkdtemp(prefix="uwb_mitigation_")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return {RESPAWN_FOLDER: folder}
+    return {tables.RESPAWN_FOLDER: folder}
 
 
 def _entries(tree: Any, section: str) -> Iterator[tuple[str, str, Any]]:

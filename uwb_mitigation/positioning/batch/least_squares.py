@@ -205,8 +205,7 @@ class Solution:
             values: float64 (n, c).
         """
         adapted = np.concatenate([-self._y, np.eye(len(self.shared))])
-        rows: NDArray[np.float64] = np.einsum("nc,ncq->nq", values, adapted[columns])
-        return rows
+        return np.asarray(np.einsum("nc,ncq->nq", values, adapted[columns]), np.float64)
 
     def covariances(self, first: int) -> NDArray[np.float64]:
         """Return the marginal covariance of each knot's `first` unknowns, float64 (K, first, first).

@@ -14,7 +14,7 @@ from typing import Any
 from uwb_mitigation.errors import LinkError, ParameterError
 from uwb_mitigation.mitigation.embedded import compiling
 from uwb_mitigation.radios.dw1000.bus import Bus
-from uwb_mitigation.radios.settings import STATE_PROBLEMS, RadioSettings, RadioStatus
+from uwb_mitigation.radios.settings import RadioSettings, RadioStatus
 from uwb_mitigation.radios.wire import messages
 from uwb_mitigation.radios.wire.layout import MAX_PAYLOAD_BYTES, MessageType
 from uwb_mitigation.radios.wire.messages import RadioConfigured
@@ -87,9 +87,7 @@ class NativeRadio:
         until_us = time.monotonic_ns() // 1000 + round(timeout_s * 1e6)
         event = self._call(self._library.native_radio_exchange, until_us)
         if event == _FAULT:
-            text = STATE_PROBLEMS.get(
-                self.status().state, "the DW1000 was reset, or did not finish a command in time"
-            )
+            text = self.status().problem or "the DW1000 was reset, or did not finish a command in time"
             raise LinkError(text, where=self._bus.name)
         return self._measurement() if event == _RANGED else None
 
@@ -110,8 +108,7 @@ class NativeRadio:
     @property
     def address(self) -> int:
         """Address of the radio; 0 until the chip has started."""
-        address: int = self._library.native_radio_address(self._radio)
-        return address
+        return int(self._library.native_radio_address(self._radio))
 
     @property
     def settings(self) -> RadioSettings:

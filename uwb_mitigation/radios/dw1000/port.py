@@ -12,23 +12,9 @@ from typing import Any
 from uwb_mitigation.errors import ParameterError, format_id
 from uwb_mitigation.radios.dw1000.bus import Bus
 from uwb_mitigation.radios.dw1000.native import NativeRadio, load_native
+from uwb_mitigation.radios.parameters import PREFIX, ValueReader, read_ports, read_radio
 from uwb_mitigation.radios.port import ExchangeMonitor, OnEvent, PortReport, RadioPort
-from uwb_mitigation.radios.settings import (
-    DEFAULT_RADIO,
-    EXCHANGE_REMEDIES,
-    PREFIX,
-    PortMessage,
-    RadioSettings,
-    RadioState,
-    RadioStatus,
-    Role,
-    ValueReader,
-    radio_values,
-    read_ports,
-    read_radio,
-    settings_text,
-    status_warning,
-)
+from uwb_mitigation.radios.settings import PortMessage, RadioSettings, RadioState, RadioStatus, Role
 
 STATUS_INTERVAL_S = 1.0
 SENSORS_INTERVAL_S = 10.0
@@ -42,7 +28,7 @@ class ChipSettings:
     """Settings of a radio: port of its bus, what it does, and its reset line (see `SpidevBus`)."""
 
     port: str
-    radio: RadioSettings = DEFAULT_RADIO
+    radio: RadioSettings
     reset: str = ""
 
 
@@ -102,7 +88,7 @@ class ChipPort(RadioPort):
         on_event: OnEvent,
         stamp_clock: Callable[[], int],
     ) -> None:
-        super().__init__(settings.port, on_event, ExchangeMonitor(EXCHANGE_REMEDIES))
+        super().__init__(settings.port, on_event, ExchangeMonitor(RadioStatus.REMEDIES))
         settings.radio.check()
         load_native()
         self.settings: RadioSettings | None = None
@@ -128,12 +114,12 @@ class ChipPort(RadioPort):
         with self._lock:
             settings, status = self.settings, self.status
             is_tag = self._requested_settings.role is Role.TAG
-            warning = "" if settings is None else status_warning(status)
+            warning = "" if settings is None else status.warning
             if is_tag or self._requested_settings.report:
                 warning = warning or self.monitor.warning(self._requested_settings.interval_us / 1e6)
             hardware = "no radio" if settings is None else f"radio {format_id(settings.address)}"
             values: dict[str, object] = {"openings": self.openings}
-            values |= radio_values(settings, status)
+            values |= status.values(settings)
             activity = "ranging" if is_tag else "answering"
             return PortReport(self.device, hardware, self._lost, warning, activity, values)
 
@@ -177,7 +163,7 @@ class ChipPort(RadioPort):
             self.status = status
         if starts:
             self._was_connected = True
-            text = f"radio {format_id(radio.address)} at {self.device}: {settings_text(radio.settings)}"
+            text = f"radio {format_id(radio.address)} at {self.device}: {radio.settings.text}"
             events.insert(0, PortMessage(logging.INFO, text))
         return events
 

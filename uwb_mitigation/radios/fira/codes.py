@@ -56,33 +56,24 @@ class SessionState(enum.IntEnum):
     IDLE = 3
 
 
-EXCHANGE_REMEDIES = {
-    "negative distance": "the boards are closer than 1 m, or their antenna delay is not calibrated",
-    "transmission failed": "load the calibration of the board again, as after a chip erase",
-    "reception timeout": "are the other boards on, with the same channel, addresses, session id and interval?",
-    "PHY decoding error": "the signal is weak, or other radios use the channel",
-    "no time of arrival": "the signal is weak, or other radios use the channel",
-    "STS error": "the boards need the same STS and preamble code; or the signal is weak",
-}
+_EXCHANGES = {
+    0x1B: ("negative distance", "the boards are closer than 1 m, or their antenna delay is not calibrated"),
+    0x20: ("transmission failed", "load the calibration of the board again, as after a chip erase"),
+    0x21: ("reception timeout", "are the other boards on, with the same channel, addresses, session id and interval?"),
+    0x22: ("PHY decoding error", "the signal is weak, or other radios use the channel"),
+    0x23: ("no time of arrival", "the signal is weak, or other radios use the channel"),
+    0x24: ("STS error", "the boards need the same STS and preamble code; or the signal is weak"),
+}  # fmt: skip
+EXCHANGE_REMEDIES = dict(_EXCHANGES.values())
 """{cause of an exchange without a range: what to do}."""
 
 UNEXPECTED_CAUSES = ("negative distance", "transmission failed")
 """Causes that do not occur because a board is out of range."""
 
-EXCHANGE_CAUSES = {
-    0x1B: "negative distance",
-    0x20: "transmission failed",
-    0x21: "reception timeout",
-    0x22: "PHY decoding error",
-    0x23: "no time of arrival",
-    0x24: "STS error",
-}
-"""{status of a range: cause}."""
-
 
 def exchange_cause(status: int) -> str:
     """Return the cause of a failed exchange in words."""
-    return EXCHANGE_CAUSES.get(status, f"status 0x{status:02x}")
+    return _EXCHANGES.get(status, (f"status 0x{status:02x}", ""))[0]
 
 
 _STATUS_TEXTS = (

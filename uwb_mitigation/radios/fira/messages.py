@@ -25,7 +25,7 @@ class RangeRecord:
 
     Attributes:
         peer: address of the other board.
-        status: 0 or a key of `codes.EXCHANGE_CAUSES`.
+        status: 0, or the status that `codes.exchange_cause` explains.
         range_m: NaN = invalid.
         rssi_dbm: receive level; NaN = unknown.
     """

@@ -6,15 +6,17 @@ port calls `receive` after each read, `tick` at least ten times a second, and se
 
 from __future__ import annotations
 
+import enum
 import logging
+from collections import Counter
+from dataclasses import dataclass
 from typing import TypeVar
 
 from uwb_mitigation.errors import LinkError
 from uwb_mitigation.radios.capture import Session
 from uwb_mitigation.radios.settings import PortMessage, RadioSettings, RadioStatus
-from uwb_mitigation.radios.wire import events, messages
+from uwb_mitigation.radios.wire import messages
 from uwb_mitigation.radios.wire.clock import DeviceClock
-from uwb_mitigation.radios.wire.events import Event, LinkState, Loss
 from uwb_mitigation.radios.wire.framing import FrameDecoder, FrameEncoder, WireFrame
 from uwb_mitigation.radios.wire.layout import PROTOCOL_VERSION, Flag, MessageType, Mode
 from uwb_mitigation.radios.wire.messages import Correction, Hello, RadioConfigured
@@ -48,8 +50,55 @@ _MAX_OUTGOING_BYTES = 1 << 16
 _SEQUENCES = 1 << 32
 _STAMPED = (MessageType.RANGE_CIR, MessageType.RANGE_CORRECTED)
 
+_COUNTS = (
+    "lost stale withheld unknown_type malformed wrong_model wrong_offsets unsolicited unsent connections"
+)
+"""Counts of a session: `lost` frames (missing sequence numbers); intact frames that were not delivered, because they are `stale`
+(sequence number not above that of a frame already received), were `withheld` (received while not connected), are of an
+`unknown_type`, are `malformed` (of a known type, but with invalid contents), are corrections by the `wrong_model` or with the
+`wrong_offsets` (before the board confirmed the requested ones), or are `unsolicited` answers; requests that were `unsent`,
+because the output queue was full; and `connections`, the HELLOs that started one."""
+
 _Key = TypeVar("_Key")
 _Value = TypeVar("_Value")
+
+RADIO_PROBLEM = "the radio's settings are not used"
+OFFSETS_PROBLEM = "the offsets are not set, so the corrections of the board are not published"
+
+
+class LinkState(enum.Enum):
+    """State of the session."""
+
+    CONNECTING = "waiting for the board's HELLO"
+    READY = "connected"
+    WRONG_VERSION = "the board uses another protocol version"
+
+
+class Loss(enum.Enum):
+    """Event: why a connection ended. No data is delivered until the next `Hello`."""
+
+    TIMEOUT = "no intact frame was received for 3 s"
+    RESET = "the board restarted"
+    OUT_OF_SEQUENCE = "the sequence numbers of the board are out of order"
+    CLOSED = "the port was closed"
+
+
+@dataclass(frozen=True, slots=True)
+class Refused:
+    """The board does not use the requested settings or offsets; without the offsets, its corrections are not delivered.
+
+    Attributes:
+        problem: `RADIO_PROBLEM` or `OFFSETS_PROBLEM`.
+        text: the reason.
+    """
+
+    problem: str
+    text: str
+
+
+Event = object
+"""A `Hello` when a connection begins, a `Loss` when it ends, `Refused`, a `RangeMeasurement`, another message of the board, or a
+`PortMessage`."""
 
 
 class _Request:
@@ -110,7 +159,7 @@ class BoardSession(Session):
         self.hello: Hello | None = None
         self.radio: RadioConfigured | None = None
         self.foreign_version: int | None = None
-        self.counts = events.COUNTS.copy()
+        self.counts = Counter(dict.fromkeys(_COUNTS.split(), 0))
         self.clock = DeviceClock()
         self._decoder = FrameDecoder()
         self._encoder = FrameEncoder()
@@ -203,11 +252,11 @@ class BoardSession(Session):
                 self._send(MessageType.GET_INFO, b"")
                 return observed
             if self._send_request(self._offsets_request) and self._offsets:
-                observed.append(events.Refused(events.OFFSETS_PROBLEM, self._offsets_request.unanswered))
+                observed.append(Refused(OFFSETS_PROBLEM, self._offsets_request.unanswered))
             if self._mode_request.pending:
                 self._send_request(self._mode_request)
             elif self._send_request(self._radio_request):
-                observed.append(events.Refused(events.RADIO_PROBLEM, self._radio_request.unanswered))
+                observed.append(Refused(RADIO_PROBLEM, self._radio_request.unanswered))
         if self.state is LinkState.READY and now_ns >= self._next_sync_ns:
             self._send_sync(now_ns, stamp_ns)
         return observed
@@ -311,11 +360,11 @@ class BoardSession(Session):
             return []
         self._offsets_confirmed = answer.accepted
         text = f"it can store {answer.slots} offsets, but {len(self._offsets)} were requested"
-        return [] if answer.accepted else [events.Refused(events.OFFSETS_PROBLEM, text)]
+        return [] if answer.accepted else [Refused(OFFSETS_PROBLEM, text)]
 
     def _handle_radio(self, radio: RadioConfigured, answer: bool) -> list[Event]:
         if answer and self._radio_request.is_answered_by(radio.request_sequence) and not radio.accepted:
-            return [events.Refused(events.RADIO_PROBLEM, radio.text)]
+            return [Refused(RADIO_PROBLEM, radio.text)]
         self.radio = radio
         return [radio]
 

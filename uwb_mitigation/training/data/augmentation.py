@@ -49,8 +49,7 @@ def vary_channel(inputs: Tensor, generator: torch.Generator) -> Tensor:
     level_db = torch.where(
         is_amplified, torch.rand(n, 1, generator=generator) * MAX_GAIN_DB, torch.zeros(n, 1)
     )
-    amplified: Tensor = varied * 10 ** (level_db / 40)
-    return amplified
+    return varied * 10 ** (level_db / 40)
 
 
 def vary_noise(inputs: Tensor, generator: torch.Generator) -> Tensor:
@@ -63,8 +62,7 @@ def vary_noise(inputs: Tensor, generator: torch.Generator) -> Tensor:
     # The phase of a tap does not matter, because that of the noise is uniform.
     real = amplitude + component * torch.randn(inputs.shape, generator=generator)
     imaginary = component * torch.randn(inputs.shape, generator=generator)
-    noisy: Tensor = torch.where(is_noisy, torch.hypot(real, imaginary).sqrt(), inputs)
-    return noisy
+    return torch.where(is_noisy, torch.hypot(real, imaginary).sqrt(), inputs)
 
 
 def vary_receiver(inputs: Tensor, generator: torch.Generator) -> Tensor:
@@ -87,8 +85,7 @@ def vary_receiver(inputs: Tensor, generator: torch.Generator) -> Tensor:
     clipped = torch.minimum(filtered.clamp(min=0), limit * filtered.amax(1, keepdim=True))
     end = torch.where(uniform(0, 1) < DAMAGED_SHARE, uniform(0.2, 1.0) * samples, torch.full((n, 1), samples))
     received = torch.where(torch.arange(samples) < end, clipped, torch.zeros(())).sqrt()
-    result: Tensor = torch.where(uniform(0, 1) < OTHER_RECEIVER_SHARE, received, inputs)
-    return result
+    return torch.where(uniform(0, 1) < OTHER_RECEIVER_SHARE, received, inputs)
 
 
 def normalised(inputs: Tensor) -> Tensor:
@@ -103,6 +100,5 @@ def scaled_calibration_inputs(inputs: NDArray[np.float32], scaling: Scaling) -> 
     With levels, amplified copies are appended, so that the activations do not saturate with a strong radio.
     """
     if scaling is Scaling.MAX:
-        amplitudes: NDArray[np.float32] = normalised(torch.from_numpy(inputs)).numpy()
-        return amplitudes
+        return np.asarray(normalised(torch.from_numpy(inputs)).numpy(), np.float32)
     return np.concatenate([inputs, inputs * np.float32(10.0 ** (MAX_GAIN_DB / 2.0 / 40.0))])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import Any, NamedTuple
@@ -118,14 +118,10 @@ class _Row(NamedTuple):
     early_path_m: float
 
 
-def build_dataset(
-    records: Iterable[Record], preprocessing: Preprocessing, on_record: Callable[[], None] = lambda: None
-) -> Dataset:
+def build_dataset(records: Iterable[Record], preprocessing: Preprocessing) -> Dataset:
     """Preprocess every measurement that has a true range; count the others by reason.
 
     If no measurement has a CIR, the inputs are zero. If some have one, only those are used.
-
-    `on_record` is called with each record that was read.
 
     Raises:
         DatasetError: no measurement is usable.
@@ -134,7 +130,7 @@ def build_dataset(
     rows: list[_Row] = []
     without_cir: list[_Row] = []
     no_window = np.zeros(preprocessing.samples, np.float32)
-    for record, fault, window, early_m in _preprocessed(records, preprocessing, on_record):
+    for record, fault, window, early_m in _preprocessed(records, preprocessing):
         measurement, truth = record.measurement, record.truth
         if truth is None or not math.isfinite(truth.range_m):
             skipped["no true range"] += 1
@@ -180,7 +176,7 @@ def _dataset_of(rows: Sequence[_Row], preprocessing: Preprocessing, skipped: Map
 
 
 def _preprocessed(
-    records: Iterable[Record], preprocessing: Preprocessing, on_record: Callable[[], None]
+    records: Iterable[Record], preprocessing: Preprocessing
 ) -> Iterator[tuple[Record, int, NDArray[np.float32], float]]:
     """Yield each record with the `CirFault` of its CIR (0: none), its window, and the error of a missed direct path."""
     stream = iter(records)
@@ -191,9 +187,7 @@ def _preprocessed(
         for indices, ranges in RangeColumns.grouped(measurements):
             rows = np.flatnonzero(np.array(faults)[indices] == 0)
             early_m[np.array(indices)[rows]] = early_path_error_m(ranges, rows, preprocessing.samples)
-        for row in zip(batch, faults, windows, early_m.tolist(), strict=True):
-            on_record()
-            yield row
+        yield from zip(batch, faults, windows, early_m.tolist(), strict=True)
 
 
 def _power(levels: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,12 +14,14 @@ from uwb_mitigation.training.data import dataset as datasets
 from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.types.measurement import CirFault, Record, Truth
 
+Counted = Callable[[Iterable[Record]], Iterator[Record]]
+
 
 def load_dataset(
     path: Path,
     preprocessing: Preprocessing,
     truth: Sequence[Path] = (),
-    on_record: Callable[[], None] = lambda: None,
+    counted: Counted = iter,
 ) -> tuple[str, Dataset]:
     """Return the name of a recording (marked "simulated" if it is) and its labelled measurements.
 
@@ -27,7 +29,7 @@ def load_dataset(
         path: a bag, or another recording.
         preprocessing: preprocessing of the model.
         truth: tables of true ranges that replace those of the recording.
-        on_record: called for each record that was read.
+        counted: passes the records on, and shows their number.
 
     Raises:
         RecordingError, DatasetError: it cannot be read, or no measurement is usable.
@@ -36,7 +38,7 @@ def load_dataset(
     with formats.open_recording(path) as source:
         try:
             records = with_truth(source, table) if table else source
-            dataset = datasets.build_dataset(records, preprocessing, on_record)
+            dataset = datasets.build_dataset(counted(records), preprocessing)
         except DatasetError as error:
             if preprocessing.scaling is Scaling.MAX or CirFault.NO_PREAMBLE_COUNT.text not in error.what:
                 raise
@@ -46,9 +48,7 @@ def load_dataset(
     return (name if is_marked else f"{name} (simulated)"), dataset
 
 
-def load_inputs(
-    path: Path, preprocessing: Preprocessing, on_record: Callable[[], None] = lambda: None
-) -> Dataset:
+def load_inputs(path: Path, preprocessing: Preprocessing, counted: Counted = iter) -> Dataset:
     """Return the measurements of a recording with or without true ranges; do not use their errors.
 
     Without ground truth, each minute of a pair is one configuration.
@@ -57,7 +57,7 @@ def load_inputs(
         RecordingError, DatasetError: it cannot be read, or no CIR is usable.
     """
     with formats.open_recording(path) as source:
-        dataset = datasets.build_dataset(map(_with_configuration, source), preprocessing, on_record)
+        dataset = datasets.build_dataset(counted(map(_with_configuration, source)), preprocessing)
     if not dataset.has_cirs:
         raise DatasetError("the recording has no CIRs", where=str(path))
     return dataset

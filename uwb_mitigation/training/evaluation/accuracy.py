@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,12 +42,8 @@ class Accuracy:
     trained_on: tuple[str, ...]
 
 
-def evaluate_accuracy(
-    mitigation: Mitigation, records: Iterable[Record], on_record: Callable[[], None] = lambda: None
-) -> Accuracy:
+def evaluate_accuracy(mitigation: Mitigation, records: Iterable[Record]) -> Accuracy:
     """Correct every measurement that has a true range and a valid range, and compare it with the truth.
-
-    `on_record` is called for each record that was read.
 
     Raises:
         DatasetError: no measurement can be compared.
@@ -57,7 +53,6 @@ def evaluate_accuracy(
     read = 0
     for record, result in mitigation.correct_records(records):
         read += 1
-        on_record()
         truth = record.truth
         # An infinite variance marks an invalid range.
         if truth is None or not np.isfinite(truth.range_m + result.variance_m2):

@@ -91,8 +91,7 @@ def baseline_features(dataset: Dataset, *, header: bool) -> NDArray[np.float64]:
         columns += [rx_power, rx_power - dataset.first_path_power_dbm]
         headers = np.zeros((len(dataset), 2)) if dataset.headers is None else dataset.headers
         columns += [*headers.T.astype(np.float64), *np.log1p(headers.T.astype(np.float64))]
-    result: NDArray[np.float64] = np.nan_to_num(np.column_stack(columns), nan=0.0, posinf=0.0, neginf=0.0)
-    return result
+    return np.asarray(np.nan_to_num(np.column_stack(columns), nan=0.0, posinf=0.0, neginf=0.0), np.float64)
 
 
 def _weights(train: Dataset) -> NDArray[np.float64]:

@@ -128,8 +128,7 @@ def least_absolute_deviations(
     )
     if not solution.success:
         raise DatasetError(f"the linear bias model cannot be fitted: {solution.message}")
-    coefficients: NDArray[np.floating] = -solution.eqlin.marginals / column_scale
-    return coefficients
+    return np.asarray(-solution.eqlin.marginals / column_scale, np.float64)
 
 
 def fit_constant(configurations: NDArray[np.str_], error_m: NDArray[np.floating]) -> LinearBiasModel:
@@ -146,7 +145,4 @@ def configuration_means(
 ) -> NDArray[np.float64]:
     """Return the mean of each configuration, in the order of their names."""
     _, configuration_index = np.unique(configurations, return_inverse=True)
-    means: NDArray[np.float64] = np.bincount(configuration_index, values.astype(np.float64)) / np.bincount(
-        configuration_index
-    )
-    return means
+    return np.bincount(configuration_index, values.astype(np.float64)) / np.bincount(configuration_index)

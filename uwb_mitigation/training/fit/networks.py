@@ -75,12 +75,10 @@ class Network(nn.Module):
         values = evaluate(architecture, first, self._apply_layer, lambda name, a, b: a + b)
         *_, last = values.values()
         flat = last if isinstance(architecture, Mlp) else last.transpose(1, 2).flatten(1)
-        output: Tensor = self.head(self.dropout(flat))[:, 0]
-        return output
+        return self.head(self.dropout(flat))[:, 0]
 
     def _apply_layer(self, name: str, values: Tensor) -> Tensor:
-        output: Tensor = self.layers[_key(name)](values)
-        return output
+        return self.layers[_key(name)](values)
 
 
 def weights_of(network: Network) -> FloatWeights:

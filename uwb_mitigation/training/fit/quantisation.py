@@ -111,8 +111,7 @@ def _weight_scale(name: str, weight: NDArray[np.float32]) -> NDArray[np.float32]
     peak = np.atleast_1d(np.abs(weight).max(axis=None if name == HEAD else tuple(range(1, weight.ndim))))
     # A filter of zeros has no peak and works with any scale: use that of the other filters.
     peak = np.where(peak > 0, peak, peak.max() if peak.any() else 1.0)
-    scale: NDArray[np.float32] = (peak / WEIGHT_LIMIT).astype(np.float32)
-    return scale
+    return (peak / WEIGHT_LIMIT).astype(np.float32)
 
 
 def _peaks(weights: FloatWeights, calibration: NDArray[np.float32]) -> dict[str, float]:
