@@ -95,8 +95,8 @@ def _predict(
     F, Q, axes = np.eye(7), np.zeros((7, 7)), 2 if level else 3
     for axis in range(axes):
         F[axis, axis + 3] = dt
-        block = np.ix_((axis, axis + 3), (axis, axis + 3))
-        Q[block] = ACCELERATION**2 * np.array([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]])
+        Q[axis, axis], Q[axis + 3, axis + 3] = ACCELERATION**2 * dt**3 / 3.0, ACCELERATION**2 * dt
+        Q[axis, axis + 3] = Q[axis + 3, axis] = ACCELERATION**2 * dt**2 / 2.0
     return F @ x, F @ P @ F.T + Q
 
 

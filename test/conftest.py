@@ -8,7 +8,9 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import atexit
+import contextlib
 import fcntl
+import importlib
 import re
 import shutil
 import signal
@@ -46,10 +48,10 @@ settings.load_profile("suite")
 REPOSITORY = Path(__file__).resolve().parent.parent
 
 LONGEST = (
-    "site_page self_calibration tracking viewer_page viewer_node calibrate_command tutorial viewer_recordings "
-    "robot_estimator firmware_emulator paper_experiment firmware_parity firmware_arduino_build "
-    "robot_localization positioning locator_odometry viewer_playback serial_driver survey_anchors training px4 process "
-    "field_report demos frames installed"
+    "site_page viewer_page calibrate_command tutorial tracking viewer_node viewer_verdict self_calibration "
+    "locator_odometry px4 viewer_recordings robot_localization demos positioning robot_estimator firmware_parity "
+    "firmware_emulator robots_under_load field_report locator viewer_playback frames topic_source nodes reliability "
+    "public_api model_choice process"
 )
 """Files that start first, so that none of them runs alone at the end."""
 
@@ -72,6 +74,21 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     is_file = config.getoption("--fast") and collection_path.match("test_*.py")
     return True if is_file and SLOW.search(collection_path.read_text(encoding="utf-8")) else None
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Let each worker begin with other files: what one has compiled, the others only load."""
+    folder, worker = Path(__file__).parent, os.environ.get("PYTEST_XDIST_WORKER", "")
+    if (
+        worker
+        and not session.config.getoption("--fast")
+        and str(folder) in map(os.path.abspath, session.config.args)
+    ):
+        names = sorted(path.stem for path in folder.glob("test_*.py"))
+        first = len(names) * int(worker[2:]) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
+        for name in names[first:] + names[:first]:
+            with contextlib.suppress(Exception, pytest.skip.Exception):  # The collection reports it.
+                importlib.import_module(name)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

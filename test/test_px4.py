@@ -81,7 +81,11 @@ def build_messages(folder: Path) -> dict[str, str]:
     (source / "CMakeLists.txt").write_text(
         "cmake_minimum_required(VERSION 3.16)\nproject(px4_msgs)\nfind_package(ament_cmake REQUIRED)\n"
         "find_package(rosidl_default_generators REQUIRED)\n"
-        f"rosidl_generate_interfaces(${{PROJECT_NAME}} {files})\nament_package()\n"
+        f"rosidl_generate_interfaces(${{PROJECT_NAME}} {files})\n"
+        # One compiler call for the C++ files of a target.
+        "foreach(kind c cpp fastrtps_c fastrtps_cpp introspection_cpp)\n"
+        "  set_target_properties(${PROJECT_NAME}__rosidl_typesupport_${kind} PROPERTIES UNITY_BUILD ON)\n"
+        "endforeach()\nament_package()\n"
     )
     (source / "package.xml").write_text(
         '<package format="3"><name>px4_msgs</name><version>0.0.0</version><description>test</description>'

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from uwb_mitigation.calibration.joint_fit import medians
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.batch.least_squares import gauss_newton
 from uwb_mitigation.positioning.geometry import unit_vectors
@@ -367,7 +368,7 @@ class _AlignmentFit:
         slot = np.repeat(np.arange(len(starts)), count)
         kinds = int(noise_group.max(initial=0)) + 1
 
-        middle = np.array([np.median(values) for values in np.split(residual_m, starts[1:])])
+        middle, kind = medians(np.column_stack([residual_m, noise_group]), slot).T
         within = residual_m - middle[slot]
         # Of n values around their own median: n - 1 are left.
         several = count[slot] > 1
@@ -381,7 +382,7 @@ class _AlignmentFit:
         shared = np.add.reduceat(augmented * weight[:, None], starts) / total[:, None]
         within_group = augmented - shared[slot]
         weighted = within_group * weight[:, None]
-        kind = np.array([int(np.median(values)) for values in np.split(noise_group, starts[1:])])
+        kind = kind.astype(np.intp)
         spread = scatter_of(shared[:, -1], kind, kinds)[kind]
         persists = np.sqrt(np.maximum(spread**2 - 1.0 / total, MIN_SD_M**2))
         variance = persists**2 + 1.0 / total
