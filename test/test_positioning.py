@@ -631,7 +631,10 @@ def test_displaced_anchor_is_named_but_none_behind_an_obstacle():
     }
     assert named_anchor(lap, {1: displaced[1]}) == 1
     assert named_anchor(lap, displaced) is None, "none stands out"
-    assert named_anchor(lap, {1: lambda *tag: 0.35 * displaced[1](*tag)}) is None, "too little"
+    inner = [(2.5, 2.5), (7.5, 2.5), (7.5, 5.5), (2.5, 5.5), (2.5, 2.5)]
+    assert named_anchor([*lap, *inner], {1: lambda *tag: 0.35 * displaced[1](*tag)}) is None, "too little"
+    assert named_anchor(lap, {1: lambda *tag: 0.37 * displaced[1](*tag)}) is None, "improbable"
+    assert named_anchor(lap[1:3], {1: lambda *tag: 2.0 * displaced[1](*tag)}) is None, "few places"
     assert named_anchor(lap, {1: lambda *tag: 0.8}) is None, "an offset"
     assert named_anchor(lap, {1: lambda x, y, z: 1.5 * (4.0 < x < 6.0)}) is None, "an obstacle"
     # Errors of one aisle are not independent, however often it is driven.

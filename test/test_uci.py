@@ -487,6 +487,30 @@ def test_ranges_without_cir_are_explained_by_damages_and_rejected_parameters(kee
     )
 
 
+def test_failed_exchanges_are_explained_by_their_status():
+    run = Bench().start()
+    port, packet = run.port(), bytearray(run.range(0))
+    causes = {
+        0x24: "STS error",
+        0x23: "no time of arrival",
+        0x22: "PHY decoding error",
+        0x21: "reception timeout",
+        0x20: "transmission failed",
+        0x1B: "negative distance",
+        0x77: "status 0x77",
+    }
+    for packet[4], packet[4 + 27] in enumerate(causes):
+        port._received(bytes(packet), run.now_ns, run.now_ns)
+    assert port.monitor.totals == dict.fromkeys(causes.values(), 1)
+    assert list(port.monitor.totals) == list(causes.values())
+    # Next to ranges, only those count that have another cause than the distance.
+    now_s = time.monotonic()
+    port.monitor.add_range(now_s)
+    for cause in list(causes.values())[-4:-1]:
+        port.monitor.add_failures(cause, 9, now_s)
+    assert "9 of 28 exchanges failed: negative distance: " in port.monitor.warning()
+
+
 # Sessions --------------------------------------------------------------------------------------------------------
 
 
