@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,6 @@ from uwb_mitigation.recordings.mapping.mapping import Mapping, load_mapping, shi
 from uwb_mitigation.recordings.mcap import McapRecording
 from uwb_mitigation.types.measurement import Encoding
 
-DATA = Path(os.environ.get("UWB_MITIGATION_DATA", Path(__file__).parents[2] / "shared" / "data"))
 TEN_LINES = """
 name: my radio
 separator: ";"
@@ -445,11 +443,10 @@ def test_shipped_mapping_reads_the_files_of_its_data_set(
     assert {name: found[name] for name in expected} == expected
 
 
-def test_the_real_labyrinth_is_imported_with_its_odometry(tmp_path: Path):
-    folder = DATA / "chemnitz_labyrinth"
-    if not folder.is_dir():
-        pytest.skip(f"{folder} is absent: set UWB_MITIGATION_DATA to run this test")
-    succeed("data", "import", folder, "--map", "labyrinth", "-o", "out.mcap", folder=tmp_path)
+def test_the_real_labyrinth_is_imported_with_its_odometry(data: Path, tmp_path: Path):
+    succeed(
+        "data", "import", data / "chemnitz_labyrinth", "--map", "labyrinth", "-o", "out.mcap", folder=tmp_path
+    )
     records = list(McapRecording(tmp_path / "out.mcap"))
     assert len(records) == 233
     anchors = np.array([record.measurement.anchor_id for record in records])

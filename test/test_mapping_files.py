@@ -534,10 +534,11 @@ def test_models_get_the_radio_of_the_mapping_and_the_report_names_an_assumed_one
         (model,) = models_of(source)
         assert assumed not in model
         assert ("no model in use fits" if segment == "IPATOV" else "dw3000_sts") in model
-    line = {"name": "x", "text": "json", "fields": {"anchor": "a", "range": "r"}, "cir": {"column": "c"}}
+    line = {"name": "x", "text": "json", "fields": {"anchor": "a", "range": "r"}, "cir": PARTS}
     live = LiveConverter(Mapping.model_validate(line | {"radio": "DW3000", "segment": "STS"}), "lines")
-    (measured,) = live.measurements('{"a": 1, "r": 2.0, "c": [1, 2, 3]}', "port", 1)
+    (measured,) = live.measurements('{"a": 1, "r": 2.0, "i": [1, 3], "q": [-2, 4]}', "port", 1)
     assert CirKind.of(measured.cir).source == (RadioType.DW3000, Segment.STS)
+    assert measured.cir.samples.tolist() == [1, -2, 3, 4]
     with pytest.raises(ValidationError, match="segment: needs radio"):
         of(text, tmp_path / "x.csv", segment="STS")
 

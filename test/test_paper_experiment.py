@@ -261,15 +261,6 @@ def test_command_writes_its_results(folder):
     assert result["command"].startswith("python -m benchmarks paper protocol --data rooms.mcap")
 
 
-@pytest.mark.parametrize(
-    "words", [("--windows", "a"), ("--windows", "0"), ("--networks", "cnn"), ("--workers", 0)]
-)
-def test_invalid_options_are_rejected_with_one_line(folder, words):
-    done = run("paper", "protocol", "--data", "rooms.mcap", "-o", "x", *words, folder=folder)
-    assert done.returncode == 2
-    assert len(done.stderr.splitlines()) == 1
-
-
 def test_missing_or_damaged_results_are_rejected_by_name(tmp_path):
     path = tmp_path / RESULTS
     for content in (None, "[1", "{}", json.dumps({"models": [{}]}), "[" * 10_000):

@@ -191,11 +191,6 @@ def test_gtec_messages(types: None):
     message = SimpleNamespace(originId=0x6A40, destinationId=0x6A41, range=2500, seq=1, **fields)
     assert convert.take(message) == [(0x6A40, 0x6A41, 2.5)]
     assert convert.published[0].cir.samples.tolist() == [1, -2, 3, 4]
-    document = {"name": "x", "type": "std_msgs/msg/String", "topics": ["/log"], "text": "json"}
-    document |= {"fields": {"anchor": "a", "range": "r"}, "cir": {"column": "i", "imaginary": "q"}}
-    convert = Convert(Mapping.model_validate(document))
-    convert.take(String(data='{"a": 3, "r": 2.5, "i": [1, 3], "q": [-2, 4]}'))
-    assert convert.published[0].cir.samples.tolist() == [1, -2, 3, 4]
 
 
 def test_standard_messages():
