@@ -132,9 +132,6 @@ def test_driver_counts_messages_that_do_not_fit_and_goes_on(ros: Ros):
         ros.diagnosis("driver", lambda s, reason=reason: int(diagnostic_values(s).get(reason, 0)) > 2)
 
 
-# The mappings ----------------------------------------------------------------------------------------------------
-
-
 class Convert:
     """Passes messages of a shipped mapping to `TopicFeed` without DDS."""
 
