@@ -49,9 +49,9 @@ from uwb_mitigation.types.ros.topics import (
 TYPES = (RANGE_CIR_TYPE, RANGE_TRUTH_TYPE, RANGE_CORRECTED_TYPE)
 
 
-def write_bag(path: Path, count: int = 5, **options: bool) -> Path:
-    with BagWriter(path, {"source": "a test", "simulated": "true"}, **options) as bag:
-        for number in range(count):
+def write_bag(path: Path) -> Path:
+    with BagWriter(path, {"source": "a test", "simulated": "true"}) as bag:
+        for number in range(5):
             bag.write(record(number))
             write_corrected(bag, record(number).measurement, corrected(number))
     return path

@@ -75,6 +75,8 @@ def test_help_fits_80_columns_and_needs_no_checkout(words: tuple[str, ...], tmp_
 
 
 SIMULATE, EVALUATE, OFFSET = "data simulate -o x.mcap", "evaluate --data x.mcap", "offset x.mcap"
+TRAIN, UNIVERSAL = "train --data x.mcap", "train-universal -o x.onnx"
+REPORT, PROTOCOL = "field-report --source uci --port a --distance 3", "paper protocol --data x.mcap -o x"
 WRONG_USAGE = {
     "trakc": "No such command 'trakc'",
     "track": "Missing argument 'BAG'",
@@ -92,6 +94,22 @@ WRONG_USAGE = {
     f"{OFFSET} --distance nan": "distance = nan",
     f"{OFFSET} --truth -o none/o.yaml": "a file in an existing folder",
     f"{OFFSET} --truth --anchor door": "anchor = 'door'",
+    "process x.mcap -o y.mcap --jobs 0": "jobs = 0",
+    f"{TRAIN} -o none/x.onnx": "none/x.onnx: cannot be written",
+    f"{TRAIN} -o x.txt": "x.txt: cannot be written",
+    f"{TRAIN} -o .": ".: cannot be written",
+    f"{UNIVERSAL} --samples 2000": "2000 samples (1 to 1016)",
+    f"{UNIVERSAL} --scaling loud": "'loud' is not one of 'preamble'",
+    f"{UNIVERSAL} --radio dw1001": "'dw1001' is not one of 'dw1000'",
+    **{f"{UNIVERSAL} --{name} -1": f"--{name}" for name in ("seed", "blocks", "workers")},
+    f"{REPORT} --source radio": "'radio' is not one of 'uci'",
+    f"{REPORT} --port ''": "0 ports",
+    f"{REPORT} --port a,b,c": "3 ports",
+    f"{REPORT} --distance nan": "--distance nan",
+    f"{REPORT} -o report.txt": "report.txt: cannot be written",
+    f"{PROTOCOL} --windows a": "windows 'a'",
+    f"{PROTOCOL} --windows 0": "0 samples (1 to 1016)",
+    f"{PROTOCOL} --workers 0": "'--workers'",
     "data info x.mcap --json /absent/x.json": "its folder does not exist",
     "data info x.mcap --json /": "is a folder",
     "data info x.mcap --json .": "is a folder",

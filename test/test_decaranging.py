@@ -27,9 +27,6 @@ START_NS = 1_515_417_223 * 10**9  # 2018-01-08 13:13:43 UTC
 SECOND = int(DEVICE_TICK_HZ)
 
 
-# ---- a small writer of the format ----
-
-
 def header(file: str = "File:20180108-131343_All.log, created by DecaRanging MP Version 3.05") -> str:
     return f"{file}\nMode: 2, Chan 2, Code 9, PRF 64, Plength 1024, DataRate 1, PAC 2, ic:1000fa35\n\n"
 
@@ -117,9 +114,6 @@ def contents(records: Iterable[Record]) -> list[tuple[float, list[int]]]:
     return [(record.measurement.range_m, record.measurement.cir.samples.tolist()) for record in records]
 
 
-# ---- exchanges ----
-
-
 @pytest.mark.parametrize("name", ["7.log", "7.log.xz"])
 def test_exchange_becomes_a_measurement_with_the_cir_of_final(write, name):
     records, skipped = read(write(header(), exchange(5.644976), name=name))
@@ -154,9 +148,6 @@ def test_invalid_start_time_becomes_the_epoch(write, file):
     records, skipped = read(write(header(file), exchange(5.0)))
     assert records[0].measurement.stamp_ns == 250_000_000
     assert skipped == counts(Anomaly.NO_START_TIME)
-
-
-# ---- malformed parts are counted, and no range is lost ----
 
 
 @pytest.mark.parametrize(
@@ -217,9 +208,6 @@ def test_malformed_accumulator_loses_only_the_cir(write, bad):
     assert skipped == counts(Anomaly.MALFORMED, Anomaly.NO_CIR)
 
 
-# ---- damage ----
-
-
 def test_log_cut_at_any_byte_yields_the_exchanges_before_the_cut(write):
     path = write(header(), exchange(1.0), exchange(2.0, 1.0), exchange(3.0, 2.0))
     data = path.read_bytes()
@@ -256,9 +244,6 @@ def test_other_file_is_refused_and_named(tmp_path, name, data):
     with pytest.raises(RecordingError) as caught:
         list(open_decaranging(path))
     assert str(path) in caught.value.where
-
-
-# ---- folders and surveys ----
 
 
 @pytest.fixture

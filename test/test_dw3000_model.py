@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bag_material import write_records
-from model_material import measurement
 from typer.testing import CliRunner
 
 from uwb_mitigation.commands.cli import app
@@ -24,10 +23,6 @@ from uwb_mitigation.types.measurement import Cir, RadioType, RangeMeasurement, R
 
 UNUSED_SEED = 424_242
 MODEL = load_bundle(shipped_model_path("dw3000_sts"))
-OTHERS = (
-    *((RadioType.UNKNOWN, Segment.UNKNOWN), (RadioType.DW1000, Segment.IPATOV)),
-    *((RadioType.DW3000, Segment.IPATOV), (RadioType.QM35, Segment.STS)),
-)
 
 
 @pytest.fixture(scope="module")
@@ -68,15 +63,6 @@ def test_windows_of_all_lengths_get_the_same_useful_correction(received) -> None
         shifted = [replace(each, cir=cir) for each, cir in zip(ranges, cirs, strict=True)]
         corrections = [each.correction_m for each in Mitigation(MODEL).correct(shifted)]
         assert np.abs(error_m - corrections).mean() < share * constant_m
-
-
-def test_short_windows_and_other_sources_pass_through(received) -> None:
-    few = windows(received[0][:5], 12)
-    other = [measurement(radio=radio, segment=segment) for radio, segment in OTHERS]
-    for expected, ranges in ((Status.BAD_CIR, few), (Status.OUT_OF_DISTRIBUTION, other)):
-        results = Mitigation(MODEL).correct(ranges)
-        assert {each.status for each in results} == {expected}
-        assert all(each.range_m == each.range_raw_m for each in results)
 
 
 def test_it_is_chosen_for_a_recording_of_the_sts_and_marked_as_experimental(received, tmp_path: Path) -> None:

@@ -187,11 +187,6 @@ def test_silent_board_gives_a_report(report: Report, tmp_path: Path, monkeypatch
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--source", "radio"), "radio"),
-        (("--port", ""), "port"),
-        (("--port", "a,b,c"), "3 ports"),
-        (("--distance", "nan"), "distance"),
-        (("-o", "report.txt"), "report.txt"),
         (("-o", "earlier.zip"), "exists already"),
         (("-o", "earlier.zip", "--force"), "is not there"),
     ],

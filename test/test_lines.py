@@ -49,9 +49,6 @@ def session_of(name: str, number: int = 0) -> LineSession:
     return session
 
 
-# Lines -----------------------------------------------------------------------------------------------------------
-
-
 FIRST, SECOND = (0x022E, 3.44), (0x9280, 15.68)
 
 
@@ -157,9 +154,6 @@ def test_a_log_and_a_live_port_give_the_same_ranges(tmp_path: Path):
     assert (recorded, len(recorded)) == (live, 4)
     assert session.stamp_offset_s == 0.0, "the number of the row is no time of a live line"
     assert log.anchors.anchors[log.anchors.index[0x9280]].position == (7.95, 0.0, -1.2)
-
-
-# Ports -----------------------------------------------------------------------------------------------------------
 
 
 def open_board(port: Path | str, kind: str, capture: Path | str = "") -> PortEvents:
@@ -278,9 +272,6 @@ def test_a_full_disk_ends_the_capture_but_not_the_ranges(tmp_path: Path):
         assert (message.level, message.text) == (logging.ERROR, text)
         events.wait_for(RangeMeasurement, 3)
         assert events.port.openings == 1
-
-
-# The driver ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.ros

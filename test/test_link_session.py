@@ -99,6 +99,7 @@ def test_lost_request_for_a_mode_is_repeated():
     bench.run(600)
 
     assert bench.received(PortMessage) == [PortMessage(logging.INFO, "the board is in mode DEVICE")]
+    assert not connected(mode=Mode.HOST).received(PortMessage), "it is in this mode already"
 
 
 class Correcting(Board):

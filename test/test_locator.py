@@ -120,6 +120,7 @@ def test_ranges_yield_poses_odometry_smoothed_poses_and_markers(ros: Ros, anchor
     # Of a tag that was switched off, nothing that was true before is repeated.
     lost = re.compile(r"Position of tag 9 lost: no ranges of tag 9 for (1[1-9]|[2-9]\d) s")
     status = ros.diagnosis("locator", lambda status: lost.search(status.message) is not None)
+    assert 0 <= status.message.find("4711") < lost.search(status.message).start(), "it hides no other warning"
     assert {key for key in diagnostic_values(status) if key.startswith("tag 9 ")} == {
         "tag 9 lever arm",
         "tag 9 position",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,6 @@ from uwb_mitigation.recordings.mapping.mapping import Mapping, load_mapping, shi
 from uwb_mitigation.recordings.mcap import McapRecording
 from uwb_mitigation.types.measurement import Encoding
 
-DATA = Path(os.environ.get("UWB_MITIGATION_DATA", Path(__file__).parents[2] / "shared" / "data"))
 TEN_LINES = """
 name: my radio
 separator: ";"
@@ -270,9 +268,6 @@ def test_truncated_bag_is_read_up_to_the_damage(name: str, tmp_path: Path):
     assert "only the rows before are used" in source.warnings[0]
 
 
-# Shipped mappings ------------------------------------------------------------------------------------------------
-
-
 def test_every_shipped_mapping_is_valid_and_names_its_source():
     names = shipped_mappings()
     assert {"ewine", "miluv", "rcv", "ghent_office", "ghent_industrial", "ghent_university"} <= set(names)
@@ -445,11 +440,10 @@ def test_shipped_mapping_reads_the_files_of_its_data_set(
     assert {name: found[name] for name in expected} == expected
 
 
-def test_the_real_labyrinth_is_imported_with_its_odometry(tmp_path: Path):
-    folder = DATA / "chemnitz_labyrinth"
-    if not folder.is_dir():
-        pytest.skip(f"{folder} is absent: set UWB_MITIGATION_DATA to run this test")
-    succeed("data", "import", folder, "--map", "labyrinth", "-o", "out.mcap", folder=tmp_path)
+def test_the_real_labyrinth_is_imported_with_its_odometry(data: Path, tmp_path: Path):
+    succeed(
+        "data", "import", data / "chemnitz_labyrinth", "--map", "labyrinth", "-o", "out.mcap", folder=tmp_path
+    )
     records = list(McapRecording(tmp_path / "out.mcap"))
     assert len(records) == 233
     anchors = np.array([record.measurement.anchor_id for record in records])
@@ -463,9 +457,6 @@ def test_the_real_labyrinth_is_imported_with_its_odometry(tmp_path: Path):
         for place in ([record.tag_position for record in records], odometry.pose[:, :2])
     )
     assert driven == pytest.approx(moved, rel=0.1)
-
-
-# Values, errors and warnings -------------------------------------------------------------------------------------
 
 
 def with_text(cir: str, samples: str) -> tuple[str, dict[str, Any]]:
@@ -672,6 +663,19 @@ def test_an_invalid_mapping_is_an_error_that_names_the_field(text: str, message:
         load_mapping(str(write(tmp_path / "map.yaml", f"name: x\n{text}\n")))
 
 
+@pytest.mark.parametrize("name", ["x.mat", "x.h5", "x.npy", "x.bag", "x.csv.xz", "x.csv.gz", "x.yaml"])
+def test_garbage_and_damage_in_any_format_are_typed_errors(name: str, tmp_path: Path):
+    path, document = tmp_path / name, PLAIN | {"topics": ["/x"]}
+    if name == "x.h5":
+        _hdf5(path)
+        path.write_bytes(path.read_bytes().replace(b"HEAP", b"HEAD", 1))
+        with pytest.raises(RecordingError, match="cannot be read"):
+            read(document | {"group": "log", "cir": {"column": "cir"}}, path)
+    path.write_bytes(b"\x93NUMPY garbage \x00\xff" * 40)
+    with pytest.raises(RecordingError):
+        read(document, path)
+
+
 @pytest.mark.parametrize(
     "text",
     [
@@ -686,20 +690,3 @@ def test_a_hostile_yaml_file_is_a_typed_error(text: str, tmp_path: Path):
     anchors = {"files": "anchors.yaml", "id": "key", "position": ["x", "y", 0]}
     with pytest.raises(RecordingError):
         of("t,a,r\n0,1,2\n", tmp_path / "x.csv", anchors=anchors)
-
-
-@pytest.mark.parametrize("name", ["x.mat", "x.h5", "x.npy", "x.bag", "x.csv.xz", "x.csv.gz", "x.yaml"])
-def test_garbage_in_any_format_is_a_typed_error(name: str, tmp_path: Path):
-    if name == "x.h5":
-        pytest.importorskip("h5py")
-    (tmp_path / name).write_bytes(b"\x93NUMPY garbage \x00\xff" * 40)
-    with pytest.raises(RecordingError):
-        read(PLAIN | {"topics": ["/x"]}, tmp_path / name)
-
-
-def test_a_damaged_file_of_a_library_is_a_typed_error(tmp_path: Path):
-    path = tmp_path / "x.h5"
-    _hdf5(path)
-    assert b"HEAP" in path.read_bytes()
-    with pytest.raises(RecordingError, match="cannot be read"):
-        of(path.read_bytes().replace(b"HEAP", b"HEAD", 1), path, group="log", cir={"column": "cir"})

@@ -70,9 +70,6 @@ def with_cir(samples: Iterable[float]) -> str:
     return f't,a,r,cir\n0,2,3.0,"{" ".join(map(str, samples))}"\n'
 
 
-# Text files ------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("suffix", "compress"), [("gz", gzip.compress), ("xz", lzma.compress)])
 def test_rows_before_the_damage_of_a_packed_file_are_used(suffix: str, compress: Any, tmp_path: Path):
     text = "t,a,r\n" + "".join(f"{n},1,{np.sin(n) + 3:.9f}\n" for n in range(8_000))
@@ -169,9 +166,6 @@ def test_other_formats_are_refused_with_a_way(tmp_path: Path, monkeypatch: pytes
         of(b"", tmp_path / "x.h5")
 
 
-# Values ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("unit", "factor"), [("mm", 1000), ("cm", 100)])
 @pytest.mark.parametrize("truth", [TRUE, {}], ids=["with truth", "without truth"])
 def test_unit_of_one_anchor_is_found_and_can_be_set(unit: str, factor: float, truth: Any, tmp_path: Path):
@@ -233,9 +227,6 @@ def test_missing_file_of_anchors_is_named(tmp_path: Path):
         of(HEADER + rows(), tmp_path / "x.csv", anchors=anchors)
     source = of(HEADER + rows(), tmp_path / "x.csv", anchors=anchors | {"optional": True})
     assert source.notes == [f"no anchors: no file 'site/anchors.csv' in {tmp_path}"]
-
-
-# Stamps ----------------------------------------------------------------------------------------------------------
 
 
 def test_two_boots_are_two_parts(tmp_path: Path):
@@ -317,8 +308,6 @@ def test_repeated_rows_are_dropped_unless_the_clock_is_coarse(tmp_path: Path):
     assert source.warnings == ["54 ranges repeat the stamp of another range of the same pair"]
 
 
-# Logs ------------------------------------------------------------------------------------------------------------
-
 LOG = """boot v1.2
 [12] Range: 2.31 m  from: 1D  RX power: -78.2 dBm
 [112] Range: 2.35 m  from: 1E  RX power: -79 dBm
@@ -351,9 +340,6 @@ def test_json_lines_and_documents_are_read(tmp_path: Path):
     assert source.dropped == {"lines without a range, such as 'ready' (not JSON: 'ready')": 1}
     document = json.dumps({"runs": {"one": rows[:1], "two": rows[1:]}})
     assert values_of(of(document, tmp_path / "x.json", group="runs[][]")) == values_of(source)
-
-
-# Public data sets ------------------------------------------------------------------------------------------------
 
 
 def test_murp(tmp_path: Path):
@@ -534,10 +520,11 @@ def test_models_get_the_radio_of_the_mapping_and_the_report_names_an_assumed_one
         (model,) = models_of(source)
         assert assumed not in model
         assert ("no model in use fits" if segment == "IPATOV" else "dw3000_sts") in model
-    line = {"name": "x", "text": "json", "fields": {"anchor": "a", "range": "r"}, "cir": {"column": "c"}}
+    line = {"name": "x", "text": "json", "fields": {"anchor": "a", "range": "r"}, "cir": PARTS}
     live = LiveConverter(Mapping.model_validate(line | {"radio": "DW3000", "segment": "STS"}), "lines")
-    (measured,) = live.measurements('{"a": 1, "r": 2.0, "c": [1, 2, 3]}', "port", 1)
+    (measured,) = live.measurements('{"a": 1, "r": 2.0, "i": [1, 3], "q": [-2, 4]}', "port", 1)
     assert CirKind.of(measured.cir).source == (RadioType.DW3000, Segment.STS)
+    assert measured.cir.samples.tolist() == [1, -2, 3, 4]
     with pytest.raises(ValidationError, match="segment: needs radio"):
         of(text, tmp_path / "x.csv", segment="STS")
 

@@ -198,9 +198,6 @@ def test_failing_network_passes_the_range_through(tmp_path, session):
     assert [(result.status, result.range_m) for result in results] == [(Status.MODEL_ERROR, 3.0)] * 2
 
 
-# --- variance, and out-of-distribution measurements ---
-
-
 @pytest.mark.parametrize("scaling", Scaling)
 def test_energy_before_the_first_path_needs_no_level(scaling):
     amplitude = np.zeros((1, 157), np.float32)

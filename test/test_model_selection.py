@@ -47,9 +47,6 @@ def numbered(error_of):
     return replace(data, error_m=error, range_m=3.0 + error)
 
 
-# --- selection ---
-
-
 def test_simplest_candidate_is_preferred_unless_a_richer_one_gains():
     errors = {"a": np.array([1.0]), "b": np.array([0.99]), "c": np.array([0.9])}
     assert selection.select_simplest(errors, 0.02) == "c"
@@ -82,9 +79,6 @@ def test_trained_network_must_show_its_gain_in_the_nested_error(monkeypatch):
     assert selection.select_nested(data, offered, 3, 0).chosen == "half"
 
 
-# --- candidates ---
-
-
 def test_cold_start_fits_an_offset(tmp_path):
     data, source = dataset(20, 3, samples=32), bundle(tmp_path)
     _, start, *_ = candidates.with_cold_start(candidates.new_models(RECIPE), data, source)
@@ -103,9 +97,6 @@ def test_cold_start_is_preferred_with_few_configurations_only(tmp_path):
     assert names(dataset(19, 2)) == [candidates.COLD_START, *candidates.NEW_MODELS]
     assert names(dataset(20, 2)) == ["constant", candidates.COLD_START, "line", "line+network", "network"]
     assert names(dataset(20, 2, samples=8)) == list(candidates.NEW_MODELS)
-
-
-# --- true ranges from a table ---
 
 
 def write(folder, *rows: str, header: str = "tag_id,anchor_id,range_m,start_s,stop_s,configuration"):
@@ -150,9 +141,6 @@ def test_file_that_is_not_a_truth_table_is_refused(tmp_path):
         with pytest.raises(RecordingError) as caught:
             load_truth(path)
     assert caught.value.suggestion == "did you mean 'anchor'?"
-
-
-# --- the command ---
 
 
 def run_or_raise(*arguments: object) -> str:

@@ -62,7 +62,7 @@ def test_tag_and_anchor_on_usb_recover_from_unplugging(boards: tuple[EmulatedEvb
             assert (measured.tag_id, measured.anchor_id) == (tag.settings.address, anchor.settings.address)
             assert len(measured.cir) == 157
             assert abs(time.time_ns() - measured.stamp_ns) < GENEROUS_S * 1e9
-        assert tag.settings.antenna_delay == 2 * 16436
+        assert (tag.settings.antenna_delay, tag.settings.reply_us) == (2 * 16436, 16_500)
         wait_until(lambda: tag.problem == "")
 
         taken: list[int] = []

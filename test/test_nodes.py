@@ -211,8 +211,6 @@ def test_another_node_of_the_same_name_is_reported_but_not_one_that_may_have_bee
     ros.diagnosis("left/mitigator", lambda status: warning not in status.message)
 
 
-# Driver and mitigator in one process ------------------------------------------------------------------------------
-
 PLAY = ("count:=200", "seed:=1", "simulated_rate:=400.0", *PAUSED)
 
 

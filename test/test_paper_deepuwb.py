@@ -66,9 +66,6 @@ def amplitudes_of(records: list[Record]) -> np.ndarray:
     return np.array([record.measurement.cir.samples * record.measurement.cir.scale for record in records])
 
 
-# --- reading ---
-
-
 @pytest.mark.parametrize(
     "writing",
     [
@@ -183,9 +180,6 @@ def test_other_files_are_rejected_by_name(tmp_path: Path, content: bytes) -> Non
     assert caught.value.where == str(path)
 
 
-# --- rooms and splits ---
-
-
 def named(names: np.ndarray) -> Dataset:
     """Return a dataset whose measurements have these configurations."""
     plain = dataset(1, len(names), samples=4)
@@ -207,9 +201,6 @@ def test_other_data_is_split_by_configuration() -> None:
     assert not set(parts.train.names) & set(parts.test.names)
     with pytest.raises(DatasetError):
         experiment_data.split_dataset("deepuwb", named(np.array(["deepuwb/room1/clear"] * 3)))
-
-
-# --- simulated ---
 
 
 def room(record: Record) -> int:
@@ -249,8 +240,6 @@ def test_command_simulates_a_bag_that_can_be_played(tmp_path: Path) -> None:
     assert run("paper", "simulate", "--ranges", "7", "-o", "x.mcap", folder=tmp_path).returncode == 2
     assert not (tmp_path / "x.mcap").exists()
 
-
-# --- download, against a server on this machine ---
 
 CONTENT = bytes(range(256)) * 1000
 SHA256 = hashlib.sha256(CONTENT).hexdigest()

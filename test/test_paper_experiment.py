@@ -50,9 +50,6 @@ def finished(tmp_path_factory) -> tuple[Path, ExperimentResults]:
         return folder, experiment.run_experiment(parts(), folder, wanted, QUICK, trials=3)
 
 
-# --- networks that are trained together ---
-
-
 @pytest.mark.parametrize("shape", SHAPES)
 def test_stack_is_trained_like_single_networks(shape, monkeypatch):
     data = dataset(2, 20, samples=shape.samples)
@@ -90,9 +87,6 @@ def test_pruned_weights_stay_zero_and_each_network_has_the_share():
         assert magnitudes[zeros].max() <= magnitudes[~zeros].min()
 
 
-# --- before the training ---
-
-
 def test_search_is_random_then_a_grid_around_the_best_network(finished):
     found = finished[1].trials
     assert [trial.stage for trial in found] == ["random"] * 3 + ["grid"] * 3
@@ -106,9 +100,6 @@ def test_search_is_random_then_a_grid_around_the_best_network(finished):
     for trial, cost in zip(found, costs, strict=True):
         is_better = (costs <= cost).all(axis=1) & (costs < cost).any(axis=1)
         assert trial.is_on_front == (not is_better.any())
-
-
-# --- the experiment ---
 
 
 def test_tasks_are_every_window_of_remnet_and_the_longest_of_the_rest():
@@ -176,8 +167,6 @@ def test_shorter_windows_are_scaled_by_their_own_maximum():
         shorten_windows(data, 64)
 
 
-# --- the report ---
-
 PARTS = ["method", "data", "table1", "table2", "search", "table3", "fig3", "fig4a", "fig4b", "fig5", "lr"]
 HOSTILE = "<script>alert(1)</script>_$\\frac{$"
 
@@ -238,9 +227,6 @@ def test_hostile_names_are_only_text_and_simulated_results_are_marked(full, fini
     assert full.html().count("Simulated data, not comparable") >= 3
 
 
-# --- commands ---
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
     """Simulated rooms in `rooms.mcap`."""
@@ -259,15 +245,6 @@ def test_command_writes_its_results(folder):
     assert (result["data"], result["split"]) == ("rooms.mcap (simulated)", "paper")
     assert (result["train"], result["test"]) == (131, 48)  # the share of the published rows
     assert result["command"].startswith("python -m benchmarks paper protocol --data rooms.mcap")
-
-
-@pytest.mark.parametrize(
-    "words", [("--windows", "a"), ("--windows", "0"), ("--networks", "cnn"), ("--workers", 0)]
-)
-def test_invalid_options_are_rejected_with_one_line(folder, words):
-    done = run("paper", "protocol", "--data", "rooms.mcap", "-o", "x", *words, folder=folder)
-    assert done.returncode == 2
-    assert len(done.stderr.splitlines()) == 1
 
 
 def test_missing_or_damaged_results_are_rejected_by_name(tmp_path):

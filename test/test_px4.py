@@ -195,8 +195,6 @@ def test_missing_px4_msgs_is_a_one_line_error(ros: Ros):
     assert node.output.startswith("error: px4_msgs is not installed (build the branch of")
 
 
-# Ranges ----------------------------------------------------------------------------------------------------------
-
 ZURICH = (47.397742, 8.545594, 488.0)
 ANCHORS = {0x022E: (0.0, 0.0, 2.0), 0x9280: (8.0, 0.0, 2.0), 0xDCAE: (8.0, 6.0, 2.0), 0x5431: (0.0, 6.0, 2.0)}
 MIN_INTERVAL_US = 10_600

@@ -185,9 +185,6 @@ def test_power_dependent_bias_is_corrected_if_enabled():
     assert abs(rows["range_m"].mean() - 5 + bias_m) < 0.005
 
 
-# A host -----------------------------------------------------------------------------------------------------------
-
-
 def talk(air: ModelledAir, board: int, session: Any, seconds: float) -> list[Any]:
     """Connect a board with the session of its host; return the events."""
     events: list[Any] = []

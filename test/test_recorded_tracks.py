@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -41,8 +40,7 @@ from uwb_mitigation.viewer.headline import cards
 from uwb_mitigation.viewer.playback import BagPlayer
 from uwb_mitigation.viewer.state import View
 
-DATA = Path(os.environ.get("UWB_MITIGATION_DATA", Path(__file__).parents[2] / "shared" / "data"))
-HANYANG, LABYRINTH = DATA / "hanyang_outdoor", DATA / "chemnitz_labyrinth"
+HANYANG, LABYRINTH = "hanyang_outdoor/NLOS_A1", "chemnitz_labyrinth"
 BOX = Area((-20.0, -60.0, -2.0), (80.0, 60.0, 4.0))
 
 
@@ -54,32 +52,33 @@ def indexed(bag: Path, settings: TrackSettings) -> BagPlayer:
 
 
 @pytest.fixture(scope="module")
-def imported(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path | None], Path]:
-    """Return a function that imports a recording once (None: a simulated drive), and returns the bag."""
+def imported(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Callable[[str], Path]:
+    """Return a function that imports a recording once (empty: a simulated drive), and returns the bag."""
 
     @cache
-    def import_once(source: Path | None) -> Path:
+    def import_once(source: str) -> Path:
         folder = tmp_path_factory.mktemp("imported")
-        if source is None:
-            succeed("data simulate --like drive --ranges 300 -o raw.mcap", folder=folder)
-        elif source.exists():
+        if source:
             name = ["--map", "labyrinth"] if source == LABYRINTH else []
-            succeed("data", "import", source, *name, "-o", "raw.mcap", folder=folder)
+            data = request.getfixturevalue("data")
+            succeed("data", "import", data / source, *name, "-o", "raw.mcap", folder=folder)
         else:
-            pytest.skip(f"no {source}")
+            succeed("data simulate --like drive --ranges 300 -o raw.mcap", folder=folder)
         return folder / "raw.mcap"
 
     return import_once
 
 
-SIMULATED = (None, ["--height", "0", "--odometry", "/odom", "--imu", "/imu"],
+SIMULATED = ("", ["--height", "0", "--odometry", "/odom", "--imu", "/imu"],
              TrackSettings(0.0, odometry="/odom", imu="/imu"))  # fmt: skip
 
 
 @pytest.mark.parametrize(
     ("source", "options", "settings", "processed"),
     [
-        (HANYANG / "NLOS_A1", ["--stamp-offset=-0.2", "--height", "1", "--area=-20,-60,-2,80,60,4"],
+        (HANYANG, ["--stamp-offset=-0.2", "--height", "1", "--area=-20,-60,-2,80,60,4"],
          TrackSettings(1.0, area=BOX, stamp_offset_s=-0.2), False),
         (LABYRINTH, ["--height", "0", "--odometry", "/odom"], TrackSettings(0.0, odometry="/odom"), True),
         (*SIMULATED, False),
@@ -90,7 +89,7 @@ SIMULATED = (None, ["--height", "0", "--odometry", "/odom", "--imu", "/imu"],
 def test_track_and_view_give_the_same_figures(
     imported,
     tmp_path: Path,
-    source: Path | None,
+    source: str,
     options: list[str],
     settings: TrackSettings,
     processed: bool,
@@ -112,11 +111,11 @@ def test_track_and_view_give_the_same_figures(
     ):
         live, raw, smoothed = (f"{result[kind][key]:.3f} m" for kind in ("live", "raw_live", "smoothed"))
         assert figures[title] == (live, f"raw + same filter: {raw}; smoothed: {smoothed}")
-        if source is not None:
+        if source:
             assert live == raw, "nothing was corrected"
     shown = [notice.split(": ", 1)[1] for notice in timeline.notices]
     assert [text for text in shown if text in tag["warnings"]] == tag["warnings"]
-    if source is not None:
+    if source:
         value, text = figures["Ranges corrected, whole recording"]
         assert (value, "ranges: no CIRs" in text) == ("none", True)
 
@@ -144,12 +143,10 @@ def test_contradictory_settings_are_refused(options: dict[str, object]):
         TrackSettings(**options)
 
 
-def test_variance_of_ranges_without_cir_is_that_of_real_errors(tmp_path: Path):
+def test_variance_of_ranges_without_cir_is_that_of_real_errors(data: Path):
     """The mean squared error of each real drive is at most four variances."""
-    if not (HANYANG.exists() and LABYRINTH.exists()):
-        pytest.skip(f"no {DATA}")
     corrector = Mitigation(load_bundle(default_model_path()), read_offsets("0.1"))
-    for run_source in real_runs(DATA)[0]:
+    for run_source in real_runs(data)[0]:
         recorded = run_source.read()
         measurements = [item.measurement for item in recorded.read_records()]
         variance_m2 = np.array([result.variance_m2 for result in corrector.correct(measurements)])
@@ -198,7 +195,7 @@ def test_track_and_view_have_the_same_options(command):
 
 
 def test_report_is_one_file_with_the_figures_of_track(imported, tmp_path: Path):
-    bag, page = imported(None), tmp_path / "drive.html"
+    bag, page = imported(""), tmp_path / "drive.html"
     options = ("--height", "0", "--json", "track.json", "--report", page, "--png", tmp_path / "map.png")
     succeed("track", bag, "-o", "track.mcap", *options, folder=tmp_path)
     rmse_m = json.loads((tmp_path / "track.json").read_text())["live"]["horizontal_rmse_m"]

@@ -38,7 +38,7 @@ def test_heading_is_found_from_any_start(facing: float):
     track = estimator.run(robot.ranges())
     found_s = track.stamp_ns[np.isfinite(track.yaw[:, 0])][0] / NANOSECONDS
     distance, of_yaw, sd = robot.errors(track, 12.0)
-    assert found_s < 15.0
+    assert 9.0 < found_s < 15.0, "one that is confirmed earlier may be that of late odometry"
     assert len(of_yaw) == len(distance), "the heading is not lost again"
     assert rms(of_yaw) < math.radians(3.0)
     assert np.mean(np.abs(of_yaw) < 1.96 * sd) > 0.9

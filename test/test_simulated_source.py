@@ -86,9 +86,6 @@ def test_levels_are_of_the_order_of_real_logs(drive: list[Record]) -> None:
     assert 0.2 < np.min(peaks) < np.max(peaks) < 1.6
 
 
-# --- the commands ---
-
-
 @pytest.mark.parametrize("like", ["buildings", "drive"])
 def test_command_writes_a_bag_marked_as_simulated(tmp_path: Path, like: str) -> None:
     ranges = 100
@@ -111,9 +108,6 @@ def test_command_writes_a_bag_marked_as_simulated(tmp_path: Path, like: str) -> 
     assert np.nanmean(wider) - np.nanmean(levels) > 0.5, "channel 5 is weaker than channel 2"
     again = CliRunner().invoke(app, words)
     assert "--force" in str(again.exception)
-
-
-# --- errors --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

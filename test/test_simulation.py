@@ -43,15 +43,9 @@ def lone_paths(n: int, power_db: float, delay_ns: float = 0.0) -> Multipath:
     return Multipath(np.full((n, 1), delay_ns), gain)
 
 
-# --- channel ---------------------------------------------------------------------------------------
-
-
 def test_direct_path_loses_free_space_and_obstacles() -> None:
     power = direct_power_db(np.array([1.0, 10.0]), np.array([0.0, 6.0]), CHANNEL_2)
     np.testing.assert_allclose(power, [-44.5, -44.5 - 26.0], atol=0.1)
-
-
-# --- scene -----------------------------------------------------------------------------------------
 
 
 def test_wall_delays_by_its_optical_thickness_and_weakens() -> None:
@@ -98,9 +92,6 @@ def test_robot_stays_inside_the_flat_moves_steadily_and_drives_through_nothing()
     step = np.hypot(*np.diff(position, axis=0).T)
     assert step.max() <= 0.05 + 1e-9
     assert FLAT.direct_path(position[:-1], position[1:]).crossings.max() == 0
-
-
-# --- radio -----------------------------------------------------------------------------------------
 
 
 def test_pulse_has_unit_energy_over_the_taps_and_no_sidelobes() -> None:

@@ -83,7 +83,7 @@ class ExchangeMonitor:
     """
 
     def __init__(self, remedies: Mapping[str, str], unexpected: Iterable[str] = ()) -> None:
-        self.remedies, self._unexpected = remedies, frozenset(unexpected)
+        self.remedies, self._unexpected = remedies, tuple(unexpected)
         self.totals: Counter[str] = Counter()
         self._failures: deque[tuple[float, str, int]] = deque()
         self._ranges: deque[float] = deque(maxlen=4096)
