@@ -262,6 +262,10 @@ def test_bands_contain_the_measurements_they_are_computed_from():
     found = OodBands.of(0.3, np.column_stack(values))
     assert (OodDetector(found.bands).score(values) <= 0).all()
     assert replace(found, known_offset_m=0.0).bands == found.bands
+    # Extended by multiples of half the width of the data, which is at least 1 m or 3 dB.
+    assert found.range_m == Band(-1.5, 11.0, 2.5)
+    assert found.power_gap_db == Band(5.0, 8.0, 3.0)
+    assert (found.power_at_1m_dbm.low, found.power_at_1m_dbm.high) == (values[1].min(), values[1].max())
 
 
 WINDOW = np.random.default_rng(0).gamma(2.0, 0.3, 157).astype(np.float32)
