@@ -48,10 +48,10 @@ settings.load_profile("suite")
 REPOSITORY = Path(__file__).resolve().parent.parent
 
 LONGEST = (
-    "site_page self_calibration tracking viewer_page viewer_node calibrate_command tutorial viewer_recordings "
-    "robot_estimator firmware_emulator paper_experiment firmware_parity firmware_arduino_build "
-    "robot_localization positioning locator_odometry viewer_playback serial_driver survey_anchors training px4 process "
-    "field_report demos frames installed"
+    "site_page viewer_page calibrate_command tutorial tracking viewer_node viewer_verdict self_calibration "
+    "locator_odometry px4 viewer_recordings robot_localization demos positioning robot_estimator firmware_parity "
+    "firmware_emulator robots_under_load field_report locator viewer_playback frames topic_source nodes reliability "
+    "public_api model_choice process"
 )
 """Files that start first, so that none of them runs alone at the end."""
 
