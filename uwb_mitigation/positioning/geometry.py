@@ -80,8 +80,8 @@ class Area:
         return inside
 
     def clip(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the nearest point of the box to each position float64 (..., 3)."""
-        return np.clip(position, self.low, self.high)
+        """Return the nearest point of the box to each position float64 (..., 3), faster than `np.clip`."""
+        return np.minimum(np.maximum(position, self.low), self.high)
 
 
 def parse_lever_arm(text: str | None) -> tuple[float, float, float] | None:

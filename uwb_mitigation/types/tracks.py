@@ -149,7 +149,7 @@ class Track(TimeSeries):
             np.array([e.covariance for e in estimates], np.float64).reshape(-1, 6, 6),
             np.array(
                 [
-                    _UNKNOWN_HEADING if e.heading is None else (e.heading.yaw, *e.heading.covariance)
+                    _UNKNOWN_HEADING if e.heading is None else (e.heading.yaw, *e.heading.covariance.tolist())
                     for e in estimates
                 ],
                 np.float64,

@@ -184,7 +184,7 @@ class HeadingTest:
 
     def _fit(self) -> None:
         """Fit the latest path for each fault, and add the log likelihood ratios."""
-        samples = np.array(self._samples)
+        samples = np.array(self._samples, np.complex128)
         time_s, distance_m, variance, *drifts = samples[:, :5].real.T
         # Later positions have no partner on a path with late stamps.
         end = int(np.searchsorted(time_s, time_s[-1] - _MAX_DELAY_S, side="right"))

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 import math
-from operator import sub
+from operator import le, sub
 
 import numpy as np
 
@@ -137,7 +137,7 @@ class OdometryFilter:
     def confine(self, area: Area) -> None:
         """Move the antenna into a box."""
         antenna = self.antenna
-        if all(low <= at <= high for low, at, high in zip(area.low, antenna, area.high, strict=True)):
+        if all(map(le, area.low, antenna)) and all(map(le, antenna, area.high)):
             return
         nearest, arm = area.clip(np.array(antenna)), np.subtract(antenna, self.state.x[:3])
         for axis in np.flatnonzero(nearest != antenna).tolist():

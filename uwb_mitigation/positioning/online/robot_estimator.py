@@ -130,8 +130,8 @@ class RobotEstimator:
         if isinstance(measurement, TagHeight):
             return self.tag.add(measurement)
         while self._recorded and self._recorded[0][0] <= measurement.stamp_ns:
-            recorded_ns, add, values = self._recorded.popleft()
-            add(recorded_ns, *values)
+            _, add, message = self._recorded.popleft()
+            add(*message)
         published = self.tag.update(measurement)
         self._update_headings(measurement)
         return self._estimate(published, self._heading_filter, measurement.stamp_ns)
@@ -160,11 +160,11 @@ class RobotEstimator:
         recorded: list[tuple[int, Callable[..., None], Any]] = []
         if (imu := self._robot.imu) is not None:
             rows = rows_of(imu.stamp_ns, imu.yaw_rate, imu.yaw_rate_variance)
-            recorded += [(stamp_ns, self.odometry.add_imu, values) for stamp_ns, *values in rows]
+            recorded += [(row[0], self.odometry.add_imu, row) for row in rows]
         if (motion := self._robot.odometry) is not None:
             variance = np.diagonal(motion.twist_covariance, axis1=1, axis2=2)
             rows = rows_of(motion.stamp_ns, motion.pose, motion.twist, variance)
-            recorded += [(stamp_ns, self.odometry.add, values) for stamp_ns, *values in rows]
+            recorded += [(row[0], self.odometry.add, row) for row in rows]
         return recorded
 
     def _estimate(
