@@ -149,7 +149,7 @@ def test_ranges_yield_poses_odometry_smoothed_poses_and_markers(ros: Ros, anchor
         (
             {},
             [1, 2],
-            "not determined: mirrored position: the 2 received anchors are within .* Remedy: an area on one side.*",
+            "not determined: mirrored position: the 2 received anchors leave two mirror positions.* Remedy: an area on one side.*",
         ),
         (
             {},

@@ -400,7 +400,7 @@ def test_names_on_the_map_do_not_cover_each_other(browser: Browser, view: View, 
             "  r.data_source.data[r.glyph.text.field].filter((_, i) => r.view.filter.booleans?.[i]))"
         )
 
-    browser.wait("names", lambda: {"tag 7", "column 17"} <= set(shown()))
+    browser.wait("names", lambda: {"tag 7", "column 17 selected"} <= set(shown()))
     first = shown()
     assert 3 < len(first) < 15
     for _ in range(8):

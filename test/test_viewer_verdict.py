@@ -26,7 +26,7 @@ from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.scene import NodeStatus, Scene
 from uwb_mitigation.viewer.server import ViewerServer
 from uwb_mitigation.viewer.state import View
-from uwb_mitigation.viewer.verdict import LOOKS, HeldVerdict, predicted_accuracy
+from uwb_mitigation.viewer.verdict import LOOKS, NOT_CORRECTED, HeldVerdict, predicted_accuracy
 
 CIRCLE = NodeStatus(1, "", math.nan, ("tag 7 determination: circle: R. Remedy: more anchors",))
 ANCHORS = {1: (0.0, 0.0), 2: (8.0, 0.0), 3: (0.0, 6.0), 4: (8.0, 6.0)}
@@ -65,11 +65,12 @@ def controls(scene: Scene):
 def test_good_position_has_its_accuracy_age_and_share_of_corrected_ranges():
     scene, clock = driven()
     clock.now_s += 1.0
-    state, reason, _, facts = controls(scene).verdict
+    state, reason, _, *facts = controls(scene).verdict
     assert (state, reason) == ("good", "")
-    assert facts.startswith(
-        "horizontal sd 0.10 m, 95 % within 0.17 m \u00b7 last range 1.0 s old by stamp\nsince the start: ranges corrected: 100.0 % (120 of 120 ranges)"
-    )
+    assert facts == [
+        "horizontal sd 0.10 m, 95 % within 0.17 m \u00b7 last range 1.0 s old by stamp",
+        "Since the start: ranges corrected: 100.0 % (120 of 120 ranges)",
+    ]
 
 
 def test_anchor_that_is_not_where_the_file_says_is_named_while_the_tag_moves():
@@ -81,18 +82,18 @@ def test_anchor_that_is_not_where_the_file_says_is_named_while_the_tag_moves():
         for anchor, (anchor_x, anchor_y) in (ANCHORS | {2: (8.0, 0.8)}).items():
             range_m = math.hypot(x - anchor_x, y - anchor_y)
             scene.add_sample((anchor, 7), Sample(stamp_s, range_m, range_m, 0.1, Status.OK))
-    state, reason, action, _ = controls(scene).verdict
+    state, reason, action, *_ = controls(scene).verdict
     assert (state, reason) == ("degraded", "Anchor door is probably not where the anchors file says")
     assert action.startswith("At least 0.8 m away")
 
 
 def test_anchor_that_reads_long_degrades_the_position_by_its_name():
     scene, _ = driven({2: 0.6})
-    state, reason, action, _ = controls(scene).verdict
+    state, reason, action, *_ = controls(scene).verdict
     assert (state, reason) == ("degraded", "Anchor door reads 0.60 m long")
     assert action == "Calibrate, or check its position."
     page = shown(scene)
-    assert page.column("map", "label") == ["1 \u2713", "door \u2297 +0.6 m", "3 \u2713", "4 \u2713"]
+    assert page.column("map", "label") == ["1 \u2713 selected", "door \u2297 +0.6 m", "3 \u2713", "4 \u2713"]
     assert page.column("map", "health")[1] == health.BAD
     assert page.column("pairs", "state").count(health.BAD) == 1
 
@@ -120,7 +121,7 @@ def test_marks_of_anchors_have_the_colours_of_their_states(browser: Browser):
 
 
 def test_anchor_to_check_is_named_below_a_good_position():
-    state, reason, action, _ = controls(driven({2: 0.2})[0]).verdict
+    state, reason, action, *_ = controls(driven({2: 0.2})[0]).verdict
     assert (state, reason) == ("good", "")
     assert action == "Anchor door reads 0.20 m long: calibrate, or check its position."
 
@@ -200,7 +201,7 @@ def test_silent_anchors_are_named_before_the_geometry_of_the_others():
     scene.tags.clear()
     scene.set_node_status("locator", CIRCLE)
     page = shown(scene)
-    state, reason, action, _ = page.controls.verdict
+    state, reason, action, *_ = page.controls.verdict
     assert (state, reason) == ("not determined", "only anchors 1 and 2 send ranges; no ranges from 3, 4")
     assert action.startswith("Find out why: check power")
     assert action.endswith("Without them: more anchors.")
@@ -243,18 +244,18 @@ def test_state_of_an_anchor_needs_evidence_and_has_hysteresis(
 
 def test_radio_without_cirs_is_a_normal_state():
     page = shown(driven(status=Status.NO_CIR)[0])
-    state, *_, facts = page.controls.verdict
-    assert state == "good"
+    state, reason, action, _, facts = page.controls.verdict
+    assert (state, reason, action) == ("good", "not corrected", NOT_CORRECTED)
     assert facts.endswith(
         "correction: none (the radio sends no CIRs) \u00b7 ranges corrected: none (0 of 120 ranges: no CIRs)"
     )
     assert "not corrected" in page.column("map", "kind")
     assert "corrected" not in page.column("map", "kind")
-    assert (
-        controls(driven(status=Status.BAD_CIR)[0])
-        .verdict[3]
-        .endswith("none (0 of 120 ranges; 120 ranges not OK)")
-    )
+    _, reason, action, _, facts = controls(driven(status=Status.BAD_CIR)[0]).verdict
+    assert (reason, "CIRs" in action) == ("not corrected", False)
+    assert facts.endswith("none (0 of 120 ranges; 120 refused (see their status))")
+    facts = controls(driven(status=Status.UNRELIABLE)[0]).verdict[4]
+    assert facts.endswith("100.0 % (120 of 120 ranges; 120 of these uncertain)")
     assert {row[0] for row in page.controls.health} == {health.GOOD}
     assert page.cards()["Ranges corrected, since the start"] == ("none", "0 of 120 ranges: no CIRs")
 
@@ -336,7 +337,7 @@ def test_map_has_heading_ellipse_and_a_legend_of_what_it_contains():
             item.label.value for item in items if hasattr(item.label, "value")
         }
 
-    assert legend() == {"raw", "corrected", "true", "OK", "tag", *LOOKS}
+    assert legend() == {"raw", "corrected", "true", "last range: OK", "tag", *LOOKS}
     states = page.document.get_model_by_name("map").legend[1].items
     assert [item.label.value for item in states] == list(LOOKS)
     assert page.column("map", "ink") == [palette.PAPER, *[palette.NIGHT] * 3], "the selected anchor"

@@ -106,10 +106,11 @@ def determination(
         positions = "a height above and one below it" if is_level else "positions on both sides of it"
         assert position is not None
         remedies = _mirror_remedies(anchors, position, symmetry, dims, area, sd_m, is_level=is_level)
-    reason = f"the {len(anchors)} received anchors are within {distance_m:.2f} m of {where}, so that {positions} explain ranges with errors of {sd_m:.2f} m"
-    if area is not None:
-        reason += "; the area does not exclude them"
-    return Determination(state.value, reason, ", or ".join(remedies))
+    reason = f"are within {distance_m:.2f} m of {where}, so that {positions} explain ranges with errors of {sd_m:.2f} m"
+    if len(anchors) == 2 and state is Ambiguity.MIRROR:
+        reason = "leave two mirror positions, on both sides of their line; at least one more is needed"
+    reason += "" if area is None else "; the area does not exclude them"
+    return Determination(state.value, f"the {len(anchors)} received anchors {reason}", ", or ".join(remedies))
 
 
 def current_determination(estimator: TagEstimator) -> Determination:
@@ -193,9 +194,8 @@ def _mirror_remedies(
 
     A known height leaves no other position if these differ in height only (`is_level`).
     """
-    remedies = []
-    if is_level or (dims == 3 and _is_unique(anchors, position, 2, sd_m)):
-        remedies.append("the height of the tag")
+    has_height_remedy = is_level or (dims == 3 and _is_unique(anchors, position, 2, sd_m))
+    remedies = ["the height of the tag"] if has_height_remedy else []
     if abs(mirror.axis[2]) > LEVEL:
         low_m, high_m = _heights(mirror, anchors, area)
         remedies.append(f"an area above z = {high_m:.2f} m or below {low_m:.2f} m")

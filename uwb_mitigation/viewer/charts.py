@@ -31,10 +31,11 @@ HEADINGS = {
 """Names and headings of the figures."""
 
 SOURCES = {
-    "anchors": "x y name id health label ink paper fit_x fit_y",
+    "anchors": "x y name id health label ink paper",
+    "fits": "x y file_x file_y name",
     "tags": "x y name colour width height angle heading",
     "tracks": "xs ys colour line_width dash kind",
-    "rays": "x y x0 y0 x1 y1 status",
+    "rays": "x y x0 y0 x1 y1 status legend",
     "accuracy": "xs ys colour step",
     "states": "x y health",
     "extent": "x y",
@@ -143,10 +144,12 @@ def _layers() -> dict[str, list[Layer]]:
     names: list[Layer] = [
         ("text", source, {
             "text": column, "text_font_size": "12px", "text_color": ink, "x_offset": x, "y_offset": y, "text_align": align,
-            "background_fill_color": paper, "background_fill_alpha": 0.8, "level": "annotation",
+            "background_fill_color": paper, "background_fill_alpha": 0.8, "padding": 3, "level": "annotation",
             "view": CDSView(filter=BooleanFilter(None if y < 0 else [])),
         })
-        for source, column, ink, paper in (("anchors", "label", "ink", "paper"), ("tags", "name", NIGHT, PAPER))
+        for source, column, ink, paper in (
+            ("fits", "name", NIGHT, PAPER), ("anchors", "label", "ink", "paper"), ("tags", "name", NIGHT, PAPER),
+        )
         for x, y, align in _SIDES
     ]  # fmt: skip
     bars: list[Layer] = [
@@ -173,14 +176,13 @@ def _layers() -> dict[str, list[Layer]]:
             ("ray", "tags", {
                 "length": HEADING_M, "angle": "heading", "line_color": NIGHT, "line_width": 3, "legend_label": "heading",
             }),
-            ("scatter", "rays", status | {"size": 7, "line_width": 2}),
+            ("scatter", "rays", status | {"size": 7, "line_width": 2, "legend_field": "legend"}),
             ("scatter", "anchors", state),
             # The legend has all states, whatever the anchors have.
             ("scatter", "states", state),
-            ("segment", "anchors", fit | {"x0": "x", "y0": "y", "x1": "fit_x", "y1": "fit_y", "line_dash": "dotted"}),
-            ("scatter", "anchors", fit | {
-                "x": "fit_x", "y": "fit_y", "marker": "square_x", "size": 13, "fill_color": None,
-                "legend_label": "where its ranges fit",
+            ("segment", "fits", fit | {"x0": "file_x", "y0": "file_y", "x1": "x", "y1": "y", "line_dash": "dotted"}),
+            ("scatter", "fits", fit | {
+                "marker": "square", "size": 13, "fill_color": None, "legend_label": "where its ranges fit",
             }),
             ("scatter", "tags", {
                 "marker": "star", "size": 18, "fill_color": "colour", "line_color": NIGHT, "legend_label": "tag",

@@ -32,9 +32,7 @@ MAX_LABEL = 20  # characters of a name on the map
 MARGIN_M = 5.0  # around a tag on a map without anchors
 RANGE_SD_M = 0.1  # for the predicted accuracy if ranges have no standard deviation
 
-_OPTIONAL = {
-    "95 % ellipse": "width", "heading": "heading", "where its ranges fit": "fit_x",
-}  # fmt: skip
+_OPTIONAL = {"95 % ellipse": "width", "heading": "heading"}
 """Layers of the map, and their columns that are NaN where they have nothing to show."""
 
 
@@ -170,7 +168,7 @@ class Figures:
             item.visible = bool(np.isfinite(data[column]).any() if column else len(next(iter(data.values()))))
 
     def _draw_anchors(self, scene: Scene) -> None:
-        page, displaced, rows = self._page, self._page.view.timeline.displaced, []
+        page, displaced, rows, fits = self._page, self._page.view.timeline.displaced, [], []
         # A report has no selection.
         selected = page.selected[0] if page.selected and math.isfinite(page.trail_s) else None
         # The selected one first: its name has priority.
@@ -178,19 +176,22 @@ class Figures:
             anchor = scene.anchors[identity]
             state, residual_m = page.health.get(identity, (health.SILENT, math.nan))
             name = anchor.name or format_id(identity)
-            label, fit = name[:MAX_LABEL], (math.nan, math.nan)
+            label = name[:MAX_LABEL]
             if state not in (health.UNKNOWN, health.SILENT):
                 label += f" {state[0]}"
             if identity in displaced:
-                label += " not here"
                 fit = displaced[identity][1].position[:2]
+                fits.append((*fit, *anchor.position[:2], f"{name[:MAX_LABEL]} ranges fit"))
+                label += " file"
             elif state in (health.BAD, health.CHECK) and abs(residual_m) >= health.LONG_M:
                 # Rounded, so that the map is not drawn again for every range.
                 label += f" {residual_m:+.1f} m"
-            # The label of the selected one is white on black.
-            colours = (PAPER, NIGHT) if identity == selected else (NIGHT, PAPER)
-            rows.append((*anchor.position[:2], name, str(identity), state, label, *colours, *fit))
+            colours = NIGHT, PAPER
+            if identity == selected:
+                label, colours = f"{label} selected", (PAPER, NIGHT)
+            rows.append((*anchor.position[:2], name, str(identity), state, label, *colours))
         set_rows(self._sources["anchors"], rows)
+        set_rows(self._sources["fits"], fits)
 
     def _draw_tags(self, scene: Scene) -> None:
         rows = []
@@ -231,8 +232,8 @@ class Figures:
             place = scene.anchors.get(anchor_id)
             if of_tag == tag_id and pose and place and not scene.no_data(history):
                 x, y, _ = place.position
-                middle = (x + pose.x) / 2, (y + pose.y) / 2
-                rows.append((*middle, x, y, pose.x, pose.y, sample.status.name))
+                middle, status = ((x + pose.x) / 2, (y + pose.y) / 2), sample.status.name
+                rows.append((*middle, x, y, pose.x, pose.y, status, f"last range: {status}"))
         set_rows(self._sources["rays"], rows)
 
     def _draw_accuracy(self, scene: Scene) -> None:

@@ -21,7 +21,7 @@ from uwb_mitigation.viewer.palette import STATUS_LOOKS, TAG_COLOURS
 from uwb_mitigation.viewer.scene import Scene
 from uwb_mitigation.viewer.state import PageState, View
 from uwb_mitigation.viewer.texts import COLUMNS, TAG_TITLES, Texts
-from uwb_mitigation.viewer.verdict import STATES
+from uwb_mitigation.viewer.verdict import LIMITS, STATES
 
 REFRESH_S = 0.1
 FAST_PAGES = 3
@@ -66,6 +66,7 @@ class Page:
             nonce=nonce,
             columns=COLUMNS,
             states=STATES,
+            limits=LIMITS,
             tag_titles=TAG_TITLES,
             figures=HEADINGS,
             tag_colours=TAG_COLOURS,

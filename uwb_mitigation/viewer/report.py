@@ -112,8 +112,8 @@ def write_report(
         raise player.error
     player.seek(player.seconds)
     figures, controls = draw_scene(View(player.scene, player=player))
-    _, _, action, facts = controls.verdict
-    lines = [f"{controls.headline}. {action}", facts, *controls.notice]
+    _, _, action, *facts = controls.verdict
+    lines = [f"{controls.headline}. {action}", *filter(None, facts), *controls.notice]
     sections: dict[str, Any] = {"Figures": [("", "", ""), *controls.cards]}
     sections |= {HEADINGS[name]: figures[name] for name in SHOWN}
     sections["Anchors at the end"] = [ANCHOR_TITLES, *controls.health]

@@ -104,7 +104,8 @@ class Scene:
         clock: returns the time for ages, s: a steady clock live, the recording's time in a replay. Stamps are not
             compared with it, because they may come from another computer.
         stamp_clock: returns the time on the clock of the stamps, s, if it is that of this computer.
-        ranges, corrected, faults: number of ranges, of those that were corrected, and of those with a status that needs attention.
+        ranges, corrected, faults, uncertain: number of ranges, of those that were corrected, of those with a status that needs
+            attention, and of those that were corrected but are UNRELIABLE.
         incidents: on the clock of the scene.
         received_s: time of the last range on the scene's clock.
         is_whole: it keeps all data of a recording; otherwise the last minute of ranges, and as many positions as a page shows.
@@ -142,7 +143,7 @@ class Scene:
         # Stamps of different tags may come from different clocks.
         self.latest_stamps: BoundedDict[int | None, tuple[float, float]] = BoundedDict(MAX_PAIRS)
         self._outages: BoundedDict[int | None, Outages] = BoundedDict(MAX_PAIRS)
-        self.ranges = self.corrected = self.faults = self.dropped = 0
+        self.ranges = self.corrected = self.faults = self.uncertain = self.dropped = 0
         self.pairs: BoundedDict[Pair, History] = BoundedDict(math.inf if self.is_whole else MAX_PAIRS)
         self.tags: BoundedDict[str, Pose] = BoundedDict(MAX_TAGS)
         self.lever_arms: BoundedDict[str, LeverArm] = BoundedDict(MAX_TAGS)
@@ -212,6 +213,7 @@ class Scene:
         self.ranges += 1
         self.corrected += sample.status.is_corrected
         self.faults += sample.status.is_fault
+        self.uncertain += sample.status is Status.UNRELIABLE
         self.incidents.add_range(pair, self.clock(), stamp_s)
         self.received_s = self.clock()
         history = self.pairs[pair]
@@ -279,7 +281,8 @@ class Scene:
     def show(self, recorded: Scene, now_s: float) -> None:
         """Show the minute before a time of a recording, and its tracks until then; counts are those of all its ranges."""
         self.clear()
-        self.ranges, self.corrected, self.faults = recorded.ranges, recorded.corrected, recorded.faults
+        self.ranges, self.corrected = recorded.ranges, recorded.corrected
+        self.faults, self.uncertain = recorded.faults, recorded.uncertain
         self.errors, self.error_counts = recorded.errors, recorded.error_counts
         self.error_sums_m = recorded.error_sums_m
         histories = [

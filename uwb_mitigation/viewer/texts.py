@@ -41,7 +41,7 @@ COLUMNS = {
 """Columns of the table of pairs after anchor and tag: {field: (title, interval, description)}."""
 
 ANCHOR_TITLES = "state", "anchor", "rate, Hz", "NLOS, %", "residual, m", "lost, %", "advice"
-TAG_TITLES = "tag", "position", "x, y, z, m", "sd, m", "age", "ranges, Hz", "range age by stamp"
+TAG_TITLES = "tag", "position", "x, y, z, m", "sd, m", "position age", "ranges, Hz", "range age by stamp"
 """Columns of the tables of anchors and of tags."""
 MAX_SHOWN_EVENTS = 8
 
@@ -90,7 +90,7 @@ class Texts:
         reports = sorted((name, report.aged(scene.clock())) for name, report in scene.node_statuses.items())
         page.set(
             headline=shown.headline(tag),
-            verdict=[*shown[:3], self._facts(scene, shown.accuracy)],
+            verdict=[*shown[:3], *self._facts(scene, shown.accuracy)],
             health=_anchor_rows(anchors, states, names),
             tag_rows=_tag_rows(scene, pairs, verdicts),
             incidents=self._incidents(scene),
@@ -155,19 +155,19 @@ class Texts:
             current = Verdict(health.WAITING, "the recording is being read")
         return self._verdicts[tag_id].update(current, scene.clock())
 
-    def _facts(self, scene: Scene, accuracy: str) -> str:
-        """Return accuracy and age, and a line for each other interval: what the correction changes, share of corrected ranges."""
+    def _facts(self, scene: Scene, accuracy: str) -> tuple[str, str]:
+        """Return accuracy and age, and a line for each interval: what the correction changes, share of corrected ranges."""
         texts = [accuracy] if accuracy else []
         if math.isfinite(stamp_s := scene.latest_stamp_s(self._page.tag_id)):
             texts.append(f"last range {scene.stamp_clock() - stamp_s:.1f} s old by stamp")
         if scene.dropped:
             texts.append(f"{scene.dropped} ranges dropped by the viewer")
-        lines = {"": texts} if texts else {}
+        lines, dot = defaultdict[str, list[str]](list), " \u00b7 "
         for title, value, text in self._cards:
             name, _, interval = title.partition(", ")
             if name in ("Ranges corrected", "Correction"):
-                lines.setdefault(f"{interval}: ", []).append(f"{name.lower()}: {value} ({text})")
-        return "\n".join(interval + " \u00b7 ".join(facts) for interval, facts in lines.items())
+                lines[f"{interval.capitalize()}: "].append(f"{name.lower()}: {value} ({text})")
+        return dot.join(texts), "\n".join(interval + dot.join(facts) for interval, facts in lines.items())
 
     def _notices(self, scene: Scene) -> list[str]:
         """Return the reasons for an empty page, and what needs attention."""

@@ -26,6 +26,11 @@ LOOKS = {
     health.SILENT: ("hex", PAPER),
 }
 """Marker and colour of an anchor for each state; statuses of ranges have other markers."""
+LIMITS = (
+    f"{health.CHECK}: residual over {health.LONG_M:.2f} m; {health.BAD}: over {health.VERY_LONG_M:.2f} m. Position good: "
+    f"horizontal sd, \u221a(sd x\u00b2 + sd y\u00b2), up to {health.MAX_SD_M:.2f} m. All limits"
+)
+"""The limits that decide most states, for the page."""
 STATES = (
     f"{health.BAD}: ranges stopped, probably displaced, or a mean residual over {health.VERY_LONG_M:.2f} m with line of sight. {health.CHECK}: a mean residual over {health.LONG_M:.2f} "
     f"m, {health.MAX_LOST:.0f} % lost, {health.MAX_NOT_OK:.0f} % with a status that needs attention, or {health.MAX_NLOS:.0f} % NLOS. {health.UNKNOWN}: fewer than "
@@ -38,6 +43,8 @@ MAX_HEADLINE = 60
 JUMP_S = 60.0
 """Time for which a jump of a clock is the reason for a missing position; of a lost one, until it is back."""
 SYNCHRONISE = "Synchronise the clocks of the computers (such as with chrony), then restart the locator."
+NOT_CORRECTED = "Ranges through obstacles stay too long: let the radio send CIRs (channel impulse responses)."
+"""What to do if no range has a CIR."""
 HOLD_S = 2.0
 """Time for which a better verdict must hold before it is shown."""
 CELLS = 40
@@ -113,8 +120,12 @@ def verdict(
     names = {anchor_id: place.name for anchor_id, place in scene.anchors.items()}
     if not reason:
         reason, action = health.degradation(anchors, states, names, sd_m)
+    state = health.DEGRADED if reason else health.POSITION_GOOD
+    if not reason and scene.ranges and not scene.corrected:
+        # Other statuses have their own advice.
+        reason, action = "not corrected", action if scene.faults else f"{action} {NOT_CORRECTED}".strip()
     return Verdict(
-        health.DEGRADED if reason else health.POSITION_GOOD,
+        state,
         reason,
         _sentence(action),
         health.accuracy_text(sd_m),

@@ -49,12 +49,12 @@ function start(doc) {
   });
   texts("notice", "notice", (text) => element("div", text));
   texts("cards", "cards", (lines) => element("div", lines.map((text, i) => element(i === 1 ? "strong" : "span", text))));
-  const [headline, action, facts] = $("verdict").children;
+  const [headline, ...statements] = [...$("verdict").children, $("intervals")];
   on("headline", () => setText(headline, controls.headline));
   on("verdict", () => {
     const [state, , ...texts] = controls.verdict;
     $("verdict").className = state ?? "";
-    [action, facts].forEach((element, i) => setText(element, texts[i] ?? ""));
+    statements.forEach((element, i) => setText(element, texts[i] ?? ""));
   });
   on("available", () => { for (const [id, is] of Object.entries(controls.available)) if ($(id)) $(id).disabled = !is; });
 
@@ -178,7 +178,7 @@ function start(doc) {
       const mark = (share, colour, text) => `<text x="${100 * share}%" y="11" fill="${colour}">${text}</text>`;
       $("bad-marks").innerHTML = bad.map((share) => mark(share, "#d55e00", "|")).join("")
         + incidents.map((share) => mark(share, "currentColor", "\u25c6")).join("");
-      $("marks-legend").textContent = `whole recording: | ranges not OK: ${faults}, \u25c6 events: ${events}`;
+      $("marks-legend").textContent = `whole recording: | ranges that need attention: ${faults}, \u25c6 events (list below): ${events}`;
     });
   }
   on("player", () => {
@@ -201,7 +201,7 @@ function start(doc) {
   doc.on_event("connection_lost", () => {
     $("lost").style.display = "block";
     // What the page shows may be wrong by now.
-    $("verdict").style.display = "none";
+    $("verdict").style.display = $("intervals").style.display = "none";
     $("age").hidden = true;
     const wait = setInterval(async () => {
       try { if ((await fetch(location.href, {cache: "no-store"})).ok) { clearInterval(wait); location.reload(); } }
