@@ -8,9 +8,7 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import atexit
-import contextlib
 import fcntl
-import importlib
 import re
 import shutil
 import signal
@@ -74,21 +72,6 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     is_file = config.getoption("--fast") and collection_path.match("test_*.py")
     return True if is_file and SLOW.search(collection_path.read_text(encoding="utf-8")) else None
-
-
-def pytest_sessionstart(session: pytest.Session) -> None:
-    """Let each worker begin with other files: what one has compiled, the others only load."""
-    folder, worker = Path(__file__).parent, os.environ.get("PYTEST_XDIST_WORKER", "")
-    if (
-        worker
-        and not session.config.getoption("--fast")
-        and str(folder) in map(os.path.abspath, session.config.args)
-    ):
-        names = sorted(path.stem for path in folder.glob("test_*.py"))
-        first = len(names) * int(worker[2:]) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
-        for name in names[first:] + names[:first]:
-            with contextlib.suppress(Exception, pytest.skip.Exception):  # The collection reports it.
-                importlib.import_module(name)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
