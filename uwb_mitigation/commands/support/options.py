@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from uwb_mitigation.positioning.track_settings import TrackSettings
 
 ScalingName = Literal["preamble", "max"]
+"""Values of `Scaling`, which takes long to import."""
 
 
 def option(text: str, *names: str, **details: Any) -> Any:
@@ -32,8 +33,6 @@ def output_option(metavar: str, text: str) -> Any:
     """Return the option `-o` for what a command writes."""
     return option(text, "-o", "--output", metavar=metavar)
 
-
-"""Values of `Scaling`, which takes long to import."""
 
 OffsetsOption = Annotated[
     str | None,
