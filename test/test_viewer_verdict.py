@@ -253,11 +253,22 @@ def test_radio_without_cirs_is_a_normal_state():
     assert "corrected" not in page.column("map", "kind")
     _, reason, action, _, facts = controls(driven(status=Status.BAD_CIR)[0]).verdict
     assert (reason, "CIRs" in action) == ("not corrected", False)
-    assert facts.endswith("none (0 of 120 ranges; 120 refused (see their status))")
+    assert facts.endswith("none (0 of 120 ranges; 120 not corrected (see their status))")
     facts = controls(driven(status=Status.UNRELIABLE)[0]).verdict[4]
     assert facts.endswith("100.0 % (120 of 120 ranges; 120 of these uncertain)")
     assert {row[0] for row in page.controls.health} == {health.GOOD}
     assert page.cards()["Ranges corrected, since the start"] == ("none", "0 of 120 ranges: no CIRs")
+
+
+def test_verdict_says_whether_the_ranges_of_this_tag_are_corrected_now():
+    scene, clock = driven()
+    for anchor_id in ANCHORS:
+        scene.add_sample((anchor_id, 8), Sample(clock.now_s + 900.0, 5.0, 5.0, 0.1, Status.OK))
+    assert controls(scene).headline == "Position of tag 7 good"
+    for anchor_id in ANCHORS:
+        status = Status.BAD_CIR if anchor_id == min(ANCHORS) else Status.NO_CIR
+        scene.add_sample((anchor_id, 7), Sample(clock.now_s + 900.01, 5.0, 5.0, 0.1, status))
+    assert controls(scene).verdict[:3] == ["good", "not corrected", NOT_CORRECTED]
 
 
 @pytest.mark.parametrize("status", [Status.OK, Status.NO_CIR])

@@ -108,7 +108,7 @@ def determination(
         remedies = _mirror_remedies(anchors, position, symmetry, dims, area, sd_m, is_level=is_level)
     reason = f"are within {distance_m:.2f} m of {where}, so that {positions} explain ranges with errors of {sd_m:.2f} m"
     if len(anchors) == 2 and state is Ambiguity.MIRROR:
-        reason = "leave two mirror positions, on both sides of their line; at least one more is needed"
+        reason = "leave two mirror positions, on both sides of their line"
     reason += "" if area is None else "; the area does not exclude them"
     return Determination(state.value, f"the {len(anchors)} received anchors {reason}", ", or ".join(remedies))
 

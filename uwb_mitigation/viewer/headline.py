@@ -43,7 +43,7 @@ def _range_cards(scene: Scene, window: str) -> list[Card]:
     text = f"{corrected} of {count} ranges" + ("" if corrected or faults else ": no CIRs")
     # An UNRELIABLE range is corrected and needs attention.
     text += f"; {scene.uncertain} of these uncertain" if scene.uncertain else ""
-    text += f"; {refused} refused (see their status)" if (refused := faults - scene.uncertain) else ""
+    text += f"; {failed} not corrected (see their status)" if (failed := faults - scene.uncertain) else ""
     shown = [[f"Ranges corrected, {window}", corrected_text, text]]
     if not corrected and not faults:
         shown.insert(0, [f"Correction, {window}", "none", "the radio sends no CIRs"])

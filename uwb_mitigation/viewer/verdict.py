@@ -14,6 +14,7 @@ from uwb_mitigation.errors import format_id
 from uwb_mitigation.positioning import health
 from uwb_mitigation.positioning.geometry import dop
 from uwb_mitigation.positioning.health import Means, Verdict
+from uwb_mitigation.types.measurement import Status
 from uwb_mitigation.viewer.histories import Pair
 from uwb_mitigation.viewer.palette import GREEN, ORANGE, PAPER, VERMILLION
 from uwb_mitigation.viewer.scene import Scene
@@ -27,7 +28,7 @@ LOOKS = {
 }
 """Marker and colour of an anchor for each state; statuses of ranges have other markers."""
 LIMITS = (
-    f"{health.CHECK}: residual over {health.LONG_M:.2f} m; {health.BAD}: over {health.VERY_LONG_M:.2f} m. Position good: "
+    f"{health.CHECK}: residual over {health.LONG_M:.2f} m; {health.BAD}: over {health.VERY_LONG_M:.2f} m with line of sight. Position good: "
     f"horizontal sd, \u221a(sd x\u00b2 + sd y\u00b2), up to {health.MAX_SD_M:.2f} m. All limits"
 )
 """The limits that decide most states, for the page."""
@@ -84,9 +85,8 @@ def verdict(
         remedy: why the position is not unique, with the remedy; empty: it is, or unknown.
     """
     name = "" if tag_id is None else f"tag {format_id(tag_id)}"
-    ages_s = [
-        scene.age_s(history.last) for (_, pair_tag), history in scene.pairs.items() if pair_tag == tag_id
-    ]
+    lasts = [last for (_, pair_tag), _, last in scene.latest() if pair_tag == tag_id]
+    ages_s = list(map(scene.age_s, lasts))
     pose = next(iter(scene.tags.values()), None) if tag_id is None else scene.tag_of(tag_id)
     received = [key for key, means in anchors.items() if means["stopped"] == 0.0]
     reason, action = _of_remedy(remedy)
@@ -121,9 +121,11 @@ def verdict(
     if not reason:
         reason, action = health.degradation(anchors, states, names, sd_m)
     state = health.DEGRADED if reason else health.POSITION_GOOD
-    if not reason and scene.ranges and not scene.corrected:
-        # Other statuses have their own advice.
-        reason, action = "not corrected", action if scene.faults else f"{action} {NOT_CORRECTED}".strip()
+    statuses = {last.status for last in lasts if scene.age_s(last) <= health.NO_DATA_S}
+    if not reason and statuses and not any(status.is_corrected for status in statuses):
+        reason = "not corrected"
+        # Other statuses have their own advice if they are frequent.
+        action = f"{action} {NOT_CORRECTED}".strip() if Status.NO_CIR in statuses else action
     return Verdict(
         state,
         reason,
