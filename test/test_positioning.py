@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from benchmarks.position_data import simulated_runs
 from benchmarks.positions import ambiguous_drives, evaluate
+from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.positioning.batch.smoother import smooth
 from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.determination import current_determination, determination, drive_determination
@@ -520,6 +521,11 @@ def test_truth_is_not_interpolated_across_gaps():
     path = TruePath(np.array([0, 1, 5]) * NANOSECONDS, np.array([[0.0, 0, 0], [1, 0, 0], [5, 0, 0]]))
     at = path.position_at(np.array([-1, 0, NANOSECONDS // 2, 3 * NANOSECONDS, 6 * NANOSECONDS]))
     np.testing.assert_array_equal(at[:, 0], [np.nan, 0, 0.5, np.nan, np.nan])
+
+
+def test_model_out_of_range_is_refused():
+    with pytest.raises(ParameterError, match="range_sd"):
+        NoiseModel(range_sd=math.nan)
 
 
 def test_ellipse_contains_95_percent_of_the_errors():

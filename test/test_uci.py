@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -982,3 +983,23 @@ def test_a_capture_ends_at_its_limit_and_ignores_what_comes_after_its_end(tmp_pa
             writer.add(0, bytes(20), sent=False)
         writer.close()
     assert 100 < (tmp_path / "session.txt").stat().st_size <= 200
+
+
+def test_a_capture_replays_the_same_measurements(tmp_path):
+    run = Bench()
+    writer = CaptureWriter(tmp_path / "session.txt")
+    writer.add_board(0, asdict(run.session.settings) | {"role": "TAG"})
+    receive = run.session.receive
+
+    def recorded(data: bytes, now_ns: int, stamp_ns: int) -> list[RangeMeasurement]:
+        writer.add(0, data, sent=False)
+        return receive(data, now_ns, stamp_ns)
+
+    run.session.receive = recorded
+    run.start().exchange(*range(1, 30))
+    writer.close()
+    capture = open_capture(tmp_path / "session.txt")
+    for _ in range(2):
+        replayed = [record.measurement for record in capture]
+        assert [m.sequence for m in replayed] == [m.sequence for m in run.measured_ranges]
+        assert all(taps_in(measured) == 16 for measured in replayed)

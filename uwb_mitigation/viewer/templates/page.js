@@ -112,9 +112,9 @@ function start(doc) {
     const boxes = named.flatMap(({data: {x, y}}) => Array.from(x, (_, i) => [9, x_scale.compute(x[i]), y_scale.compute(y[i]) + 9]));
     for (const source of named) {
       const sides = names.filter((layer) => layer.data_source === source), {data} = source, places = [...data.x].map((_, i) => sides.find(({glyph}) => {
-        const half = 3.5 * data[glyph.text.field][i].length + 2, toSide = {left: half, right: -half}[glyph.text_align.value] ?? 0;
+        const half = 3.5 * data[glyph.text.field][i].length + 5, toSide = {left: half, right: -half}[glyph.text_align.value] ?? 0;
         const box = [half, x_scale.compute(data.x[i]) + glyph.x_offset.value + toSide, y_scale.compute(data[glyph.y.field][i]) + glyph.y_offset.value];
-        return boxes.every(([half, x, y]) => Math.abs(x - box[1]) > half + box[0] || Math.abs(y - box[2]) > 14) && boxes.push(box);
+        return boxes.every(([half, x, y]) => Math.abs(x - box[1]) > half + box[0] || Math.abs(y - box[2]) > 18) && boxes.push(box);
       }));
       for (const side of sides) {
         const booleans = places.map((place) => place === side);
