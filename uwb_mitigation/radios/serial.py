@@ -13,10 +13,17 @@ from uwb_mitigation.errors import LinkError, ParameterError, format_id
 from uwb_mitigation.radios import port
 from uwb_mitigation.radios.parameters import ValueReader, read_baud, read_radio
 from uwb_mitigation.radios.settings import DEFAULT_RADIO, PortMessage, RadioSettings, RadioStatus, Role
-from uwb_mitigation.radios.wire import session as sessions
 from uwb_mitigation.radios.wire.layout import LogLevel, Mode
 from uwb_mitigation.radios.wire.messages import BoardStatus, Correction, Hello, Log, RadioConfigured
-from uwb_mitigation.radios.wire.session import BoardSession, Event, LinkState, Loss, Refused
+from uwb_mitigation.radios.wire.session import (
+    OFFSETS_PROBLEM,
+    RADIO_PROBLEM,
+    BoardSession,
+    Event,
+    LinkState,
+    Loss,
+    Refused,
+)
 from uwb_mitigation.types.measurement import RangeMeasurement
 from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets, read_offsets
 
@@ -95,11 +102,11 @@ class BoardPort(port.StreamPort):
         with self._lock:
             before, self._board = self._board, settings
             if settings.radio != before.radio:
-                self._refused.pop(sessions.RADIO_PROBLEM, None)
+                self._refused.pop(RADIO_PROBLEM, None)
                 self.session.set_radio(settings.radio or DEFAULT_RADIO)
             has_new_offsets = (settings.mode, settings.offsets) != (before.mode, before.offsets)
             if settings.mode is Mode.DEVICE and has_new_offsets:
-                self._refused.pop(sessions.OFFSETS_PROBLEM, None)
+                self._refused.pop(OFFSETS_PROBLEM, None)
                 self.session.set_offsets(settings.offsets)
             if settings.mode is not None and settings.mode != before.mode:
                 self.session.set_mode(settings.mode)

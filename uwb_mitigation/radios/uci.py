@@ -44,7 +44,7 @@ def read_settings(value: parameters.ValueReader) -> list[UciPortSettings]:
         ParameterError: a setting is invalid; names the parameter.
     """
     ports = [port.PortAddress.parse(text) for text in parameters.read_ports(value)]
-    is_tag = value("radio.role") == "tag"
+    is_tag = value(parameters.PREFIX + "role") == "tag"
     address = (*parameters.read_addresses(value, "address", 0xFFFE), 1 if is_tag else 2)[0]
     local_anchors = tuple(address + number for number in range(1, len(ports)))
     if local_anchors and not is_tag:
@@ -52,16 +52,16 @@ def read_settings(value: parameters.ValueReader) -> list[UciPortSettings]:
     anchors = parameters.read_addresses(value, "anchors", 0xFFFE) or local_anchors or (2,)
     tags = parameters.read_addresses(value, "tags", 0xFFFE) or (1,)
     peers = anchors if is_tag else tags
-    rate_hz = value("radio.rate")
+    rate_hz = value(parameters.PREFIX + "rate")
     first = UciSettings(
         role=Role.TAG if is_tag else Role.ANCHOR,
         address=address,
         peers=peers,
-        channel=value("radio.channel") or DEFAULT_CHANNEL,
-        preamble_code=value("radio.preamble_code"),
-        window=value("radio.window"),
+        channel=value(parameters.PREFIX + "channel") or DEFAULT_CHANNEL,
+        preamble_code=value(parameters.PREFIX + "preamble_code"),
+        window=value(parameters.PREFIX + "window"),
         interval_ms=round(1000 * len(peers) / rate_hz) if rate_hz else 0,
-        report=value("radio.report"),
+        report=value(parameters.PREFIX + "report"),
         sessions=len(peers),
     )
     anchor = replace(first, role=Role.ANCHOR, peers=(address,))

@@ -85,7 +85,11 @@ def verdict(
         remedy: why the position is not unique, with the remedy; empty: it is, or unknown.
     """
     name = "" if tag_id is None else f"tag {format_id(tag_id)}"
-    lasts = [last for (_, pair_tag), _, last in scene.latest() if pair_tag == tag_id]
+    lasts = [
+        history.last
+        for (_, pair_tag), history in scene.pairs.items()
+        if pair_tag == tag_id and len(history.rows)
+    ]
     ages_s = list(map(scene.age_s, lasts))
     pose = next(iter(scene.tags.values()), None) if tag_id is None else scene.tag_of(tag_id)
     received = [key for key, means in anchors.items() if means["stopped"] == 0.0]
@@ -121,7 +125,7 @@ def verdict(
     if not reason:
         reason, action = health.degradation(anchors, states, names, sd_m)
     state = health.DEGRADED if reason else health.POSITION_GOOD
-    statuses = {last.status for last in lasts if scene.age_s(last) <= health.NO_DATA_S}
+    statuses = {Status(int(last.status)) for last in lasts if scene.age_s(last) <= health.NO_DATA_S}
     if not reason and statuses and not any(status.is_corrected for status in statuses):
         reason = "not corrected"
         # Other statuses have their own advice if they are frequent.

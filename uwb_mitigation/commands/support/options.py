@@ -82,25 +82,25 @@ def check_output(output: Path, force: bool = True, suffix: str = ".onnx") -> Non
     check_replaceable([output], force)
 
 
-def _option(default: Any, kind: Any, metavar: str | None, text: str) -> tuple[Any, Any]:
+def _entry(default: Any, kind: Any, metavar: str | None, text: str) -> tuple[Any, Any]:
     """Return the default and the annotation of an option."""
     return default, Annotated[kind, option(text, metavar=metavar)]
 
 
 OPTIONS: dict[str, tuple[Any, Any]] = {
-    "height": _option(None, float | None, None, "Height of the tag's antenna in the anchors' frame, m, where it stays the same."),
-    "height_sd": _option(0.1, float, None, "Standard deviation of the height, m."),
-    "height_topic": _option(None, str | None, "TOPIC", "Topic of BAG with the measured height of the tag's antenna (Range above "
+    "height": _entry(None, float | None, None, "Height of the tag's antenna in the anchors' frame, m, where it stays the same."),
+    "height_sd": _entry(0.1, float, None, "Standard deviation of the height, m."),
+    "height_topic": _entry(None, str | None, "TOPIC", "Topic of BAG with the measured height of the tag's antenna (Range above "
                             "z = 0, Odometry or PoseWithCovarianceStamped). --height-sd is used if a message has no variance."),
-    "area": _option(None, str | None, "X,Y,Z,X,Y,Z", "Where tags can be: the lower and the upper corner of a box, m."),
-    "odometry": _option(None, str | None, "TOPIC", "Odometry of the robot with the tag (nav_msgs/Odometry): also estimate its "
+    "area": _entry(None, str | None, "X,Y,Z,X,Y,Z", "Where tags can be: the lower and the upper corner of a box, m."),
+    "odometry": _entry(None, str | None, "TOPIC", "Odometry of the robot with the tag (nav_msgs/Odometry): also estimate its "
                         "heading."),
-    "imu": _option(None, str | None, "TOPIC", "With --odometry: IMU of the robot (sensor_msgs/Imu); its yaw rate replaces that of "
+    "imu": _entry(None, str | None, "TOPIC", "With --odometry: IMU of the robot (sensor_msgs/Imu); its yaw rate replaces that of "
                    "the odometry."),
-    "lever_arm": _option(None, str | None, "X,Y,Z", "With --odometry: the antenna in the robot's frame, m. Default: from the "
+    "lever_arm": _entry(None, str | None, "X,Y,Z", "With --odometry: the antenna in the robot's frame, m. Default: from the "
                          "transforms of the bag, otherwise 0."),
-    "stamp_offset": _option(0.0, float, None, "Time to add to the stamps of the ranges, s; -0.2 if they are late by 0.2 s."),
-    "acceleration": _option(0.8, float, None, "Agility of the tags: 0.8 for robots, people and drones, less for slow vehicles. "
+    "stamp_offset": _entry(0.0, float, None, "Time to add to the stamps of the ranges, s; -0.2 if they are late by 0.2 s."),
+    "acceleration": _entry(0.8, float, None, "Agility of the tags: 0.8 for robots, people and drones, less for slow vehicles. "
                             "Square root of the spectral density of the acceleration, m/s^1.5."),
     "model": (None, ModelOption),
     "offsets": (None, OffsetsOption),
