@@ -1,7 +1,5 @@
 """Boards that print ranges as text: the source `lines`, and `pans` for a DWM1001 with its factory firmware."""
 
-from __future__ import annotations
-
 import logging
 import signal
 import socket
@@ -18,7 +16,7 @@ from uwb_mitigation_msgs.msg import Cir, RangeCir
 
 from benchmarks.equipment.emulated_board import PseudoTerminal
 from benchmarks.equipment.text_board import KINDS, PansShell, TextBoards
-from uwb_mitigation.errors import DamagedRecordingError, RecordingError
+from uwb_mitigation.errors import DamagedRecordingError, LinkError, RecordingError
 from uwb_mitigation.mitigation.model.choice import CirKind, choose_model
 from uwb_mitigation.mitigation.model.shipped import load_model
 from uwb_mitigation.nodes.support.parameter_tables import RESPAWN_FOLDER
@@ -230,6 +228,15 @@ def test_a_board_without_ranges_is_explained(ros: ros_harness.Ros, tmp_path: Pat
         wait_until(lambda: text in events.port.report().warning)
         assert events.port.report().values["lines that do not match"] == 1
     terminal.unplug()
+
+
+def test_a_port_without_data_is_opened_again_but_not_that_of_a_tag_that_reports_once_a_minute():
+    port = lines.LinePort(
+        *lines.read_settings(value_of(source="pans", port="/dev/no")), (0, None, print, lambda: 0)
+    )
+    assert port._received(b"", 65 * S, 0) == []
+    with pytest.raises(LinkError, match="sends no data"):
+        port._received(b"", 71 * S, 0)
 
 
 def test_datagrams_are_received(tmp_path: Path):

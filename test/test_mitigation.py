@@ -255,8 +255,8 @@ def test_invalid_band_is_refused(band):
 
 def test_bands_contain_the_measurements_they_are_computed_from():
     windows = np.random.default_rng(0).uniform(0.1, 1, (50, 157)).astype(np.float32)
-    power = np.linspace(-95, -80, 50, dtype=np.float32)
     range_m = np.linspace(1, 6, 50, dtype=np.float32)
+    power = np.linspace(-80, -78, 50, dtype=np.float32) - 20 * np.log10(range_m)
     windows[:, :3] /= 16
     values = ood_features(windows, Scaling.PREAMBLE, range_m, power, power - np.float32(5))
     found = OodBands.of(0.3, np.column_stack(values))
@@ -265,7 +265,7 @@ def test_bands_contain_the_measurements_they_are_computed_from():
     # Extended by multiples of half the width of the data, which is at least 1 m or 3 dB.
     assert found.range_m == Band(-1.5, 11.0, 2.5)
     assert found.power_gap_db == Band(5.0, 8.0, 3.0)
-    assert (found.power_at_1m_dbm.low, found.power_at_1m_dbm.high) == (values[1].min(), values[1].max())
+    assert found.power_at_1m_dbm == Band(values[1].min(), values[1].max(), 3.0)
 
 
 WINDOW = np.random.default_rng(0).gamma(2.0, 0.3, 157).astype(np.float32)
