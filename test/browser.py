@@ -1,7 +1,5 @@
 """Chromium of the system, controlled by Selenium, for tests of pages."""
 
-from __future__ import annotations
-
 import shutil
 import time
 from collections.abc import Callable, Iterator

@@ -3,8 +3,6 @@
 Each command also has at least one test that starts a process (`start`).
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

@@ -1,7 +1,5 @@
 """Marks of tests that compile C or C++; without a compiler they are skipped with a reason."""
 
-from __future__ import annotations
-
 import shutil
 
 import pytest

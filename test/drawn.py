@@ -1,7 +1,5 @@
 """A page of the viewer without a browser, and what it shows."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterable
 from dataclasses import replace

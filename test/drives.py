@@ -1,7 +1,5 @@
 """Simulated drives past anchors, with the range errors of the measurement model."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 
 import numpy as np

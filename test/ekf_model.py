@@ -4,8 +4,6 @@ State, Jacobian, default covariances and the order of prediction and correction 
 (`ekf.cpp`, `filter_base.cpp`), without control, delayed messages and outlier rejection.
 """
 
-from __future__ import annotations
-
 import math
 from functools import cache
 from typing import Any

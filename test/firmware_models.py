@@ -1,7 +1,5 @@
 """Exported random networks, and valid, hostile and real measurements, for tests of the firmware."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Driver and exchange of the firmware on modelled chips, compiled natively, in virtual time."""
 
-from __future__ import annotations
-
 import random
 import threading
 from collections.abc import Callable

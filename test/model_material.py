@@ -1,7 +1,5 @@
 """Networks, bundles and measurements for tests of models; all seeded."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

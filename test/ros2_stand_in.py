@@ -3,8 +3,6 @@
 `ros2 bag record` ends after the number of messages in $RECORDED_RANGES, as after Ctrl-C.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 import threading

@@ -1,7 +1,5 @@
 """Real nodes for tests: a separate DDS domain, nodes as processes, and a client."""
 
-from __future__ import annotations
-
 import fcntl
 import itertools
 import os

@@ -1,7 +1,5 @@
 """The anchors file: content and errors."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Bag writer and CDR codec, compared with the libraries rosbags and mcap; safe for arbitrary bytes."""
 
-from __future__ import annotations
-
 import contextlib
 import re
 from collections.abc import Callable

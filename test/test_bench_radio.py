@@ -1,7 +1,5 @@
 """Ranges of modelled radios at all clock errors and distances, a soak test, and the model as a library."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

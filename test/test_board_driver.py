@@ -1,7 +1,5 @@
 """Ports and settings of boards: addresses, ports that are absent or in use, settings that are refused."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

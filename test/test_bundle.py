@@ -1,7 +1,5 @@
 """Bundles: written ones are read back, and damaged or other files are refused."""
 
-from __future__ import annotations
-
 import json
 import random
 import zlib

@@ -1,7 +1,5 @@
 """`uwb-mitigation calibrate`: a bundle and offsets from a simulated drive, and from an external localisation."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

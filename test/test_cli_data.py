@@ -1,7 +1,5 @@
 """The commands `data import` and `data info`; stamps of imported recordings."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from itertools import islice

@@ -1,7 +1,5 @@
 """The terminal: tables and JSON results, help, and wrong usage of all commands."""
 
-from __future__ import annotations
-
 import io
 import json
 import math

@@ -1,7 +1,5 @@
 """DecaRanging logs: the format, malformed parts, damage, surveys, and the real recordings."""
 
-from __future__ import annotations
-
 import lzma
 import math
 import re

@@ -1,7 +1,5 @@
 """A short `make radio-demo` and `make firmware-demo`; nodes end with their demo or benchmark."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

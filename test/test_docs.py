@@ -3,8 +3,6 @@
 `make docs` checks anchors and the rest of the markup.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import re

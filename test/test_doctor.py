@@ -1,7 +1,5 @@
 """`uwb-mitigation doctor`: a complete installation passes, and broken parts are found."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from types import SimpleNamespace

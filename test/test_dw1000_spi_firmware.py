@@ -3,8 +3,6 @@
 The exchange of the anchor is written here from the layout of the frames.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterator
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """The experimental model for STS windows of a DW3000: simulated receiver, window lengths, and its automatic choice."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

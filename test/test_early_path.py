@@ -1,7 +1,5 @@
 """A direct path before the reported first path: detection on the host, and the same bits in the firmware."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The executables without ROS: help, and signals during imports."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

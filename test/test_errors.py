@@ -1,7 +1,5 @@
 """Errors for unknown names, which suggest a similar name and list the valid ones; ids as text."""
 
-from __future__ import annotations
-
 import pickle
 from collections.abc import Callable
 from functools import partial

@@ -1,7 +1,5 @@
 """Metrics, and the commands train, quantize and evaluate."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

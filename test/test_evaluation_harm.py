@@ -1,7 +1,5 @@
 """The shipped models on out-of-distribution measurements: they must not increase the error."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

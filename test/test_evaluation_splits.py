@@ -1,7 +1,5 @@
 """Datasets, splits by configuration, intervals, baselines, and models that were not fitted to the data."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """`uwb-mitigation field-report` with emulated boards, and injected faults."""
 
-from __future__ import annotations
-
 import getpass
 import json
 import math

@@ -1,7 +1,5 @@
 """Reading files up to a maximum size, and atomic writing."""
 
-from __future__ import annotations
-
 import os
 import threading
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Library and sketches, compiled with the flags of the Arduino core for the nRF52840 and linked with `ld -r`."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from collections.abc import Sequence

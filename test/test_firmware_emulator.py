@@ -3,8 +3,6 @@
 The emulator counts instructions exactly. It does not model wait states, caches and power.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import replace

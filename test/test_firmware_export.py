@@ -1,7 +1,5 @@
 """The C header: errors, and exact floats; `export-c` and `python -m benchmarks firmware`."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The wire protocol and the logic of the board in C: golden vectors, and the same bytes as `link.board.Board`."""
 
-from __future__ import annotations
-
 import ctypes
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The Arduino sketches, compiled with a replacement for the Arduino core that runs on emulated time."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import subprocess

@@ -1,7 +1,5 @@
 """Lookups in tf: map -> odom of the locator together with odom -> base_link of a robot at 50 Hz."""
 
-from __future__ import annotations
-
 import bisect
 import itertools
 import math

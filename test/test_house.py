@@ -1,7 +1,5 @@
 """Rules of the repository: layers, imports, setup and versions."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

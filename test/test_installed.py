@@ -3,8 +3,6 @@
 `make colcon` runs this in its workspace; elsewhere these tests are skipped.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shlex

@@ -1,7 +1,5 @@
 """Integer arithmetic: equal to ONNX Runtime on every bit, quantisation, and scales that are exact on all processors."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from model_material import integer_network, random_weights, windows

@@ -1,7 +1,5 @@
 """The launch files, with replacements for the launch packages of ROS, which are not on PyPI."""
 
-from __future__ import annotations
-
 import runpy
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Layouts of RViz and Foxglove: their topics and fields exist in the nodes, with types that the displays support."""
 
-from __future__ import annotations
-
 import json
 import re
 from xml.etree import ElementTree

@@ -4,8 +4,6 @@ All functions that fit to data are observed. Their inputs must not contain a row
 out at that moment, by the current fold or by the test part of a command.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace

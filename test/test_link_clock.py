@@ -1,7 +1,5 @@
 """Clock synchronisation with a board: errors with jitter, gaps, wraps, resets and steps."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 

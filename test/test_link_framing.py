@@ -3,8 +3,6 @@
 The fuzz targets of the link run briefly with bytes from Hypothesis.
 """
 
-from __future__ import annotations
-
 import itertools
 import tracemalloc
 

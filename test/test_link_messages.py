@@ -3,8 +3,6 @@
 `python test/test_link_messages.py` rewrites the vectors; use it only for a deliberate change of the protocol.
 """
 
-from __future__ import annotations
-
 import binascii
 import math
 import struct

@@ -1,7 +1,5 @@
 """A session with a board: handshake, versions, modes, stamps, losses; time and bytes are simulated."""
 
-from __future__ import annotations
-
 import logging
 
 import numpy as np

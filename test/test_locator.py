@@ -1,7 +1,5 @@
 """The node `locator` as a real process over real DDS."""
 
-from __future__ import annotations
-
 import math
 import re
 import signal

@@ -1,7 +1,5 @@
 """The node `locator` with odometry as a real process over real DDS: ranges only, with odometry, and odometry lost."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math

@@ -1,7 +1,5 @@
 """Mapping files for recordings: formats, shipped data sets, errors and warnings. All files are generated here."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

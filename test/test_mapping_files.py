@@ -1,7 +1,5 @@
 """Files as people have them: damaged, in other encodings and units, logs, several clocks; what is reported of them."""
 
-from __future__ import annotations
-
 import gzip
 import json
 import lzma

@@ -1,7 +1,5 @@
 """Reading bags: joined truth, order, errors; damaged and hostile ones up to the damage, in bounded memory."""
 
-from __future__ import annotations
-
 import struct
 import tracemalloc
 from collections.abc import Callable

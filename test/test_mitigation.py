@@ -1,7 +1,5 @@
 """Correction of valid and invalid measurements, variance, and out-of-distribution measurements."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The model is chosen by the data: the rule, `process`, `track` and the live nodes without an option."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections import Counter

@@ -1,7 +1,5 @@
 """Model selection, and `train`."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

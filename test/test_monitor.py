@@ -1,7 +1,5 @@
 """Counts, latency and errors of the monitor."""
 
-from __future__ import annotations
-
 import math
 import re
 

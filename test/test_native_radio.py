@@ -1,7 +1,5 @@
 """Local radios: emulated EVB1000s with their USB-to-SPI protocol in real time, and spidev."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import itertools

@@ -1,7 +1,5 @@
 """Driver and mitigator as real processes over real DDS, and in one process without a CIR on a topic."""
 
-from __future__ import annotations
-
 import math
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Odometry, IMU data and tf of a simulated drive: their errors, and bags that other tools read."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

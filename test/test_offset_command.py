@@ -1,7 +1,5 @@
 """`uwb-mitigation offset`: offset of the radios from a known distance, and refused ranges."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Offsets of radios: file, precedence and effect on a range."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

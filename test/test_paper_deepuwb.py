@@ -1,7 +1,5 @@
 """DeepUWB: download, reader and simulated stand-in."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import json

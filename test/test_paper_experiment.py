@@ -1,7 +1,5 @@
 """Experiment of the paper on small data, and the report of its results, through functions and commands."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

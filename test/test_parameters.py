@@ -1,7 +1,5 @@
 """Parameters of the nodes: checks, unknown names, and QoS overrides."""
 
-from __future__ import annotations
-
 import json
 import math
 import signal

@@ -1,7 +1,5 @@
 """Poses of a robot's localisation in bags of other recorders."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

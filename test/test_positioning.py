@@ -1,7 +1,5 @@
 """The filter, its initialisation, and relocalisation of a lost tag."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import re

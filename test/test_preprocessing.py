@@ -1,7 +1,5 @@
 """Preprocessing: window and bit-exact scaling. `test_mitigation` has the faults."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import struct

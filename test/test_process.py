@@ -1,7 +1,5 @@
 """`uwb-mitigation process`: copies all messages, corrects all ranges, and leaves no partial files."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """The public API: the names of `uwb_mitigation`, and the examples of its page."""
 
-from __future__ import annotations
-
 import os
 import pickle
 import re

@@ -1,7 +1,5 @@
 """The node `px4`, with a stand-in for px4_msgs that is built like the message package of this project."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math

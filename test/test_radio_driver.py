@@ -1,7 +1,5 @@
 """The node `driver` with local radios: emulated EVB1000s with USB-to-SPI, over real ROS 2."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

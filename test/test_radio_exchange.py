@@ -1,7 +1,5 @@
 """Driver and exchange of the firmware on modelled chips, and a host of a board with them, in virtual time."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import replace

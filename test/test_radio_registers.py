@@ -1,7 +1,5 @@
 """Register writes of the firmware's driver, compared with Decawave's driver."""
 
-from __future__ import annotations
-
 import ctypes
 import itertools
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """The same settings give the same figures in `track` and on the page of the viewer, on every data set of the tests."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

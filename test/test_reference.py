@@ -1,7 +1,5 @@
 """The reference pages compared with running nodes: topics, services, diagnostics, and the example of a node."""
 
-from __future__ import annotations
-
 import re
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Reliability: killed and respawned nodes, live model changes, and correct diagnostics."""
 
-from __future__ import annotations
-
 import re
 import signal
 import time

@@ -1,7 +1,5 @@
 """Position and heading of a robot with odometry."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

@@ -5,8 +5,6 @@ publishers with another QoS (`test_reliability`), two tags and a best-effort hei
 each of its states (`test_serial_driver`), during imports and at the start (`test_entry`), several pipelines (`test_nodes`).
 """
 
-from __future__ import annotations
-
 import itertools
 import signal
 import time

@@ -1,7 +1,5 @@
 """Offsets, lines and positions estimated from ranges only; synthetic geometry with known truth."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

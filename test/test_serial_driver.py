@@ -1,7 +1,5 @@
 """The driver on a board's serial link: an emulated board on a pseudo-terminal, real nodes over real DDS."""
 
-from __future__ import annotations
-
 import errno
 import os
 import signal

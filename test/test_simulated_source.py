@@ -1,7 +1,5 @@
 """Simulated drives and buildings: seeded, marked as simulated, with the correct truth; equal as records and arrays."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math

@@ -1,7 +1,5 @@
 """The simulator: channel and radio."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -4,8 +4,6 @@ A `bash` block of the page is run unchanged. Its first line may name a terminal 
 command keeps running until the next block for that terminal.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import signal

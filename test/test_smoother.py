@@ -1,7 +1,5 @@
 """The batch smoother: linear algebra, comparison with SciPy, and consistency."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Anchor positions estimated from a drive."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

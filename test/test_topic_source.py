@@ -1,7 +1,5 @@
 """Ranges on topics of other software: driver and locator over real DDS, and the shipped mappings for messages."""
 
-from __future__ import annotations
-
 import math
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`uwb-mitigation track` and `survey` on bags, and on real recordings if available."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import math

@@ -1,7 +1,5 @@
 """The networks, training of the linear bias model, of a network and of the universal model."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import astuple
 from functools import partial

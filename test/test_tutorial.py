@@ -1,7 +1,5 @@
 """The commands and the notebook of the tutorials, and the output that pages quote."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

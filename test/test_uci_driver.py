@@ -1,7 +1,5 @@
 """The node `driver` with emulated UCI boards on pseudo-terminals, over real ROS 2."""
 
-from __future__ import annotations
-
 import re
 import signal
 from array import array

@@ -1,7 +1,5 @@
 """The node `viewer` with a real driver, mitigator and locator: what the page shows is what they publish."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal

@@ -1,7 +1,5 @@
 """The viewer's page in a real browser and its server, on a scene that the test fills."""
 
-from __future__ import annotations
-
 import gzip
 import math
 import re

@@ -1,7 +1,5 @@
 """Playback of bags in the viewer, and the command in a real browser."""
 
-from __future__ import annotations
-
 import re
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Recordings on the page: stamps that differ from log times, gaps, displaced anchors."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Data of the viewer's page: rates, losses, clocks, positions from raw ranges, colours. Without a page."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

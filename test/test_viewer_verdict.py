@@ -1,7 +1,5 @@
 """Verdict, states of anchors, ages and counts of the viewer's page, without a browser."""
 
-from __future__ import annotations
-
 import io
 import math
 from collections.abc import Iterable

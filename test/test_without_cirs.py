@@ -1,7 +1,5 @@
 """Models and offsets for ranges without CIRs: constants and lines in the levels. All data is simulated here."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

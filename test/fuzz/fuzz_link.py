@@ -7,8 +7,6 @@ For ten minutes each, from the root of the repository:
     PYTHONPATH=. python test/fuzz/fuzz_link.py board -max_total_time=600 -max_len=4096
 """
 
-from __future__ import annotations
-
 import sys
 
 import atheris

@@ -3,8 +3,6 @@
 `test_link_framing.py` runs them briefly with Hypothesis, `fuzz_link.py` for long and guided by coverage.
 """
 
-from __future__ import annotations
-
 from benchmarks.equipment.board import Board
 from uwb_mitigation.radios.wire import messages
 from uwb_mitigation.radios.wire.framing import FrameDecoder, WireFrame, encode_frame
