@@ -23,15 +23,7 @@ from uwb_mitigation.types.measurement import (
     Status,
     Truth,
 )
-from uwb_mitigation.types.ros import codec, schemas
-from uwb_mitigation.types.ros.topics import (
-    RANGE_CIR_TYPE,
-    RANGE_CORRECTED,
-    RANGE_CORRECTED_TYPE,
-    RANGE_RAW,
-    RANGE_TRUTH,
-    RANGE_TRUTH_TYPE,
-)
+from uwb_mitigation.types.ros import codec, schemas, topics
 from uwb_mitigation.types.tracks import Ranges
 
 START_NS = 1_700_000_000_000_000_000
@@ -72,7 +64,9 @@ def corrected(number: int) -> CorrectedRange:
 def write_corrected(bag: BagWriter, measurement: RangeMeasurement, corrected: CorrectedRange) -> None:
     """Write the corrected range of a measurement, with the time of the measurement."""
     data, stamp_ns = codec.encode_corrected(measurement, corrected), measurement.stamp_ns
-    bag.write_message(RANGE_CORRECTED, RANGE_CORRECTED_TYPE, data, stamp_ns, measurement.sequence)
+    bag.write_message(
+        topics.RANGE_CORRECTED, topics.RANGE_CORRECTED_TYPE, data, stamp_ns, measurement.sequence
+    )
 
 
 def write_records(
@@ -106,8 +100,8 @@ class Foreign:
         self._channels[topic] = self._writer.register_channel(topic, encoding, number, {})
 
     def ours(self) -> Foreign:
-        self.channel(RANGE_RAW, RANGE_CIR_TYPE, schemas.definition(RANGE_CIR_TYPE))
-        self.channel(RANGE_TRUTH, RANGE_TRUTH_TYPE, schemas.definition(RANGE_TRUTH_TYPE))
+        self.channel(topics.RANGE_RAW, topics.RANGE_CIR_TYPE, schemas.definition(topics.RANGE_CIR_TYPE))
+        self.channel(topics.RANGE_TRUTH, topics.RANGE_TRUTH_TYPE, schemas.definition(topics.RANGE_TRUTH_TYPE))
         return self
 
     def add(self, topic: str, log_time_ns: int, data: bytes) -> None:
@@ -115,13 +109,13 @@ class Foreign:
 
     def range(self, number: int, log_time_ns: int | None = None) -> None:
         measurement = record(number).measurement
-        self.add(RANGE_RAW, log_time_ns or measurement.stamp_ns, codec.encode_range(measurement))
+        self.add(topics.RANGE_RAW, log_time_ns or measurement.stamp_ns, codec.encode_range(measurement))
 
     def truth(self, number: int, log_time_ns: int | None = None) -> None:
         known = record(number)
         assert known.truth is not None
         data = codec.encode_truth(known.measurement, known.truth)
-        self.add(RANGE_TRUTH, log_time_ns or known.measurement.stamp_ns, data)
+        self.add(topics.RANGE_TRUTH, log_time_ns or known.measurement.stamp_ns, data)
 
     def flush(self) -> None:
         self._writer.flush()

@@ -10,7 +10,6 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
-from typing import NamedTuple
 from unittest import mock
 
 import benchmarks.cli
@@ -20,15 +19,8 @@ from uwb_mitigation.commands.support import console
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parent.parent), "COLUMNS": "160"}
 """Environment of a command in its own process: the package of this repository, and the terminal width."""
 
+Finished = subprocess.CompletedProcess[str]
 OF_BENCHMARKS = ("paper", "emulate-board")
-
-
-class Finished(NamedTuple):
-    """Exit code and output of a command."""
-
-    returncode: int
-    stdout: str
-    stderr: str
 
 
 def run(words: str, *arguments: object, folder: Path, columns: int = 160) -> Finished:
@@ -52,7 +44,7 @@ def run(words: str, *arguments: object, folder: Path, columns: int = 160) -> Fin
             code = end.code or 0
         finally:
             os.chdir(before)
-    return Finished(code, out.getvalue(), err.getvalue())
+    return Finished(words, code, out.getvalue(), err.getvalue())
 
 
 def succeed(words: str, *arguments: object, folder: Path, columns: int = 160) -> Finished:
@@ -64,16 +56,8 @@ def succeed(words: str, *arguments: object, folder: Path, columns: int = 160) ->
 
 def start(words: str, *arguments: object, folder: Path) -> Finished:
     """Run the command in `folder` in a separate process; see `run`."""
-    done = subprocess.run(
-        command(words, *arguments),
-        cwd=folder,
-        env=ENVIRONMENT,
-        capture_output=True,
-        text=True,
-        timeout=240,
-        check=False,
-    )
-    return Finished(done.returncode, done.stdout, done.stderr)
+    options = {"cwd": folder, "env": ENVIRONMENT, "capture_output": True, "text": True, "timeout": 240}
+    return subprocess.run(command(words, *arguments), **options, check=False)
 
 
 def command(words: str, *arguments: object) -> list[str]:

@@ -34,17 +34,9 @@ from uwb_mitigation.types.measurement import (
     Status,
     Truth,
 )
-from uwb_mitigation.types.ros import codec, schemas
-from uwb_mitigation.types.ros.topics import (
-    RANGE_CIR_TYPE,
-    RANGE_CORRECTED,
-    RANGE_CORRECTED_TYPE,
-    RANGE_RAW,
-    RANGE_TRUTH,
-    RANGE_TRUTH_TYPE,
-)
+from uwb_mitigation.types.ros import codec, schemas, topics
 
-TYPES = (RANGE_CIR_TYPE, RANGE_TRUTH_TYPE, RANGE_CORRECTED_TYPE)
+TYPES = (topics.RANGE_CIR_TYPE, topics.RANGE_TRUTH_TYPE, topics.RANGE_CORRECTED_TYPE)
 
 
 def write_bag(path: Path) -> Path:
@@ -69,17 +61,17 @@ def test_rosbags_opens_a_bag_and_agrees_on_every_field(tmp_path: Path, name: str
             assert message.header.frame_id == "antenna"
             assert (message.tag_id, message.anchor_id) == (7, 1 + number % 2)
             expected = {
-                RANGE_RAW: {"device_time": number * 1000, "range": 4.5 + number},
-                RANGE_TRUTH: {
+                topics.RANGE_RAW: {"device_time": number * 1000, "range": 4.5 + number},
+                topics.RANGE_TRUTH: {
                     "range": 4.0 + number, "label": "NDP NLOS", "configuration": f"place {number}",
                 },
-                RANGE_CORRECTED: {
+                topics.RANGE_CORRECTED: {
                     "range": 4.25 + number, "range_raw": 4.5 + number, "correction": 0.25, "variance": 0.0625,
                     "status": 0, "source": 1, "model_id": 77,
                 },
             }[connection.topic]  # fmt: skip
             assert {name: getattr(message, name) for name in expected} == expected
-            if connection.topic == RANGE_RAW:
+            if connection.topic == topics.RANGE_RAW:
                 assert np.array_equal(message.cir.samples, record(number).measurement.cir.samples)
                 expected = {
                     "start_index": 700, "first_path_index": 740.25 + number, "encoding": 0, "scale": 1.0,
@@ -87,8 +79,8 @@ def test_rosbags_opens_a_bag_and_agrees_on_every_field(tmp_path: Path, name: str
                     "first_path_power": -83.25, "channel": 2, "prf": 64, "sample_period": np.float32(SAMPLE_PERIOD_S),
                 }  # fmt: skip
                 assert {name: getattr(message.cir, name) for name in expected} == expected
-    topics = (RANGE_RAW, RANGE_TRUTH, RANGE_CORRECTED)
-    assert sorted(read) == sorted((topic, number) for topic in topics for number in range(5))
+    names = (topics.RANGE_RAW, topics.RANGE_TRUTH, topics.RANGE_CORRECTED)
+    assert sorted(read) == sorted((name, number) for name in names for number in range(5))
 
 
 def test_bag_has_the_metadata_of_rosbag2(tmp_path: Path) -> None:
@@ -96,9 +88,9 @@ def test_bag_has_the_metadata_of_rosbag2(tmp_path: Path) -> None:
     with (tmp_path / "bag" / "bag_0.mcap").open("rb") as stream:
         reader = SeekingReader(stream, validate_crcs=True)
         assert reader.get_header().profile == "ros2"
-        _, channel, _ = next(iter(reader.iter_messages(RANGE_RAW)))
+        _, channel, _ = next(iter(reader.iter_messages(topics.RANGE_RAW)))
         records = {item.name: item.metadata for item in reader.iter_metadata()}
-    assert channel.metadata["topic_type_hash"] == schemas.type_hash(RANGE_CIR_TYPE)
+    assert channel.metadata["topic_type_hash"] == schemas.type_hash(topics.RANGE_CIR_TYPE)
     assert records["uwb_mitigation"]["simulated"] == "true"
     described = yaml.safe_load((tmp_path / "bag" / "metadata.yaml").read_text())
     stated = yaml.safe_load(records["rosbag2"]["serialized_metadata"])
@@ -136,10 +128,10 @@ def test_full_disk_raises_a_recording_error(tmp_path: Path) -> None:
     ],
 )
 def test_schema_with_other_fields_is_detected(change: tuple[str, str], difference: str) -> None:
-    text = schemas.definition(RANGE_CIR_TYPE)
+    text = schemas.definition(topics.RANGE_CIR_TYPE)
     other = re.sub(*change, text)
     assert other != text
-    assert re.search(difference, schemas.difference(other, RANGE_CIR_TYPE) or "")
+    assert re.search(difference, schemas.difference(other, topics.RANGE_CIR_TYPE) or "")
 
 
 @pytest.mark.parametrize("type_name", TYPES)
@@ -168,14 +160,7 @@ def test_qos_of_a_copied_topic_is_copied(tmp_path: Path, version: int) -> None:
             assert connection.ext.offered_qos_profiles == [qos]
 
 
-COLUMNS = (
-    "start_index",
-    "first_path_index",
-    "scale",
-    "preamble_count",
-    "rx_power_dbm",
-    "first_path_power_dbm",
-)
+COLUMNS = "start_index first_path_index scale preamble_count rx_power_dbm first_path_power_dbm"
 
 float32 = st.floats(width=32)
 uint64 = st.integers(0, 2**64 - 1)
@@ -280,8 +265,8 @@ def test_batch_equals_single_messages_or_is_refused(
         for name in ("encoding", "radio", "channel"):
             assert getattr(decoded.cir, name) == getattr(ranges, name)
         assert np.array_equal(decoded.cir.samples, ranges.samples[row])
-        expected = [getattr(decoded.cir, name) for name in COLUMNS]
-        assert repr(expected) == repr([getattr(ranges, name)[row].item() for name in COLUMNS])
+        expected = [getattr(decoded.cir, name) for name in COLUMNS.split()]
+        assert repr(expected) == repr([getattr(ranges, name)[row].item() for name in COLUMNS.split()])
         range_m, correction_m, variance_m2 = (float(column[row]) for column in columns.values())
         single = CorrectedRange(
             range_m, decoded.range_m, correction_m, variance_m2, Status(status[row]), CorrectedBy.DEVICE, 77

@@ -5,21 +5,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from command_line import run, succeed
 from model_material import Recorded, bundle, changed, record
-from typer.testing import CliRunner
 
-from uwb_mitigation.commands.cli import app
-from uwb_mitigation.errors import DatasetError, ModelError
+from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.architecture import Remnet
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.recordings import formats
 from uwb_mitigation.training.evaluation.accuracy import evaluate_accuracy
 from uwb_mitigation.training.evaluation.metrics import ErrorStatistics
-
-
-def run(*arguments: object):
-    return CliRunner().invoke(app, [str(value) for value in arguments])
 
 
 @pytest.fixture
@@ -75,34 +70,31 @@ def test_records_without_truth_or_range_are_skipped(mitigation):
 
 def test_evaluate_writes_the_documented_keys(tmp_path, recording):
     saved = bundle(tmp_path, Remnet(samples=157))
-    result = run("evaluate", "--data", "any", "--model", saved.path, "--json", tmp_path / "e.json")
-    assert result.exit_code == 0, result.output
+    done = succeed("evaluate --data any --json e.json --model", saved.path, folder=tmp_path)
     found = json.loads((tmp_path / "e.json").read_text())
     assert set(found["raw"]) == set(found["corrected"]) == {"mae", "std", "p95"}
     assert set(found["by_label"]) == {"LOS", "NLOS"}
     assert set(found["by_label"]["LOS"]) == {"n", "raw_mae", "corrected_mae"}
     assert (found["n"], found["model_id"], found["trained_on"]) == (48, saved.model_id, [])
-    assert "optimistic" not in result.output
+    assert "optimistic" not in done.stdout + done.stderr
 
 
 def test_train_quantize_evaluate_from_end_to_end(tmp_path, recording):
     pytest.importorskip("torch", reason="run `make setup-training`")
-    floats, integers = tmp_path / "float.onnx", tmp_path / "int8.onnx"
-    words = ["--samples", "8", "--epochs", "1", "--folds", "2", "--recipe", "line+network", "--json"]
-    result = run("train", "--data", "any", "-o", floats, *words, tmp_path / "t.json")
-    assert result.exit_code == 0, result.output
+    words = "--samples 8 --epochs 1 --folds 2 --recipe line+network --json t.json"
+    succeed(f"train --data any -o float.onnx {words}", folder=tmp_path)
     names = [row["name"] for row in json.loads((tmp_path / "t.json").read_text())["rows"]]
     assert names == ["raw", "overall_median", "l1_line", "float", "int8"]
-    quantise = ("quantise", floats, "--data", "any", "-o", integers)
-    assert run(*quantise).exit_code == 0
-    assert "exists already" in str(run(*quantise).exception)
-    assert run(*quantise, "--force").exit_code == 0
-    assert load_bundle(integers).card.quantised
-    assert load_bundle(integers).card.linear_bias == load_bundle(floats).card.linear_bias
-    result = run("evaluate", "--data", "any", "--model", integers, "--json", tmp_path / "e.json")
-    assert result.exit_code == 0
+    quantise = "quantise float.onnx --data any -o int8.onnx"
+    succeed(quantise, folder=tmp_path)
+    assert "exists already" in run(quantise, folder=tmp_path).stderr
+    succeed(quantise, "--force", folder=tmp_path)
+    floats, integers = (load_bundle(tmp_path / name).card for name in ("float.onnx", "int8.onnx"))
+    assert integers.quantised
+    assert integers.linear_bias == floats.linear_bias
+    done = succeed("evaluate --data any --model int8.onnx --json e.json", folder=tmp_path)
     found = json.loads((tmp_path / "e.json").read_text())
     assert found["trained_on"] == sorted(found["by_configuration"])
-    assert "optimistic" in result.output
-    again = run("quantise", integers, "--data", "any", "-o", tmp_path / "y.onnx")
-    assert isinstance(again.exception, ModelError)
+    assert "optimistic" in done.stdout + done.stderr
+    again = run("quantise int8.onnx --data any -o y.onnx", folder=tmp_path)
+    assert (again.returncode, "already quantised" in again.stderr) == (1, True)

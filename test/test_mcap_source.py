@@ -27,14 +27,8 @@ from uwb_mitigation.recordings.bag.reader import MAX_RECORD, BagReader
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.recordings.formats import open_recording
 from uwb_mitigation.recordings.mcap import McapRecording
-from uwb_mitigation.types.ros import codec
+from uwb_mitigation.types.ros import codec, topics
 from uwb_mitigation.types.ros.poses import encode_odometry
-from uwb_mitigation.types.ros.topics import (
-    ODOMETRY_TRUTH,
-    ODOMETRY_TYPE,
-    RANGE_CIR_TYPE,
-    RANGE_RAW,
-)
 from uwb_mitigation.types.tracks import Estimate
 
 
@@ -70,7 +64,7 @@ def test_tag_position_is_read_from_the_bag(tmp_path: Path) -> None:
         estimate = Estimate(record(3).measurement.stamp_ns, np.ones(3), np.ones(3), np.eye(6))
         complete = encode_odometry(estimate, child_frame_id="base_link")
         for data in (complete, complete[:50]):
-            out.write_message(ODOMETRY_TRUTH, ODOMETRY_TYPE, data, estimate.stamp_ns)
+            out.write_message(topics.ODOMETRY_TRUTH, topics.ODOMETRY_TYPE, data, estimate.stamp_ns)
     source = McapRecording(path)
     assert [item.tag_position for item in source] == places
     assert source.skipped == {"a message that is not nav_msgs/msg/Odometry": 1}
@@ -135,9 +129,9 @@ def test_missing_topic_is_reported_with_the_existing_topics(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("channel", "excerpt"),
     [
-        ((RANGE_RAW, RANGE_CIR_TYPE, None), "no schema.*RangeCir"),
-        ((RANGE_RAW, "std_msgs/msg/String", "string data"), "'std_msgs/msg/String'.*RangeCir"),
-        ((RANGE_RAW, RANGE_CIR_TYPE, "float32 range"), "another version .* 'float32 range'"),
+        ((topics.RANGE_RAW, topics.RANGE_CIR_TYPE, None), "no schema.*RangeCir"),
+        ((topics.RANGE_RAW, "std_msgs/msg/String", "string data"), "'std_msgs/msg/String'.*RangeCir"),
+        ((topics.RANGE_RAW, topics.RANGE_CIR_TYPE, "float32 range"), "another version .* 'float32 range'"),
     ],
 )
 def test_topic_of_other_layout_is_refused(
@@ -148,7 +142,7 @@ def test_topic_of_other_layout_is_refused(
     bag.range(0)
     with pytest.raises(RecordingError, match=excerpt) as caught:
         list(McapRecording(bag.finish()))
-    assert RANGE_RAW in caught.value.where
+    assert topics.RANGE_RAW in caught.value.where
 
 
 def test_end_of_the_block_closes_a_recording_and_ends_an_iteration(tmp_path: Path) -> None:

@@ -5,11 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from command_line import run, succeed
 from model_material import Recorded, bundle, dataset, measurement, windows
-from typer.testing import CliRunner
 
-from uwb_mitigation.commands.cli import app
-from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError
+from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.mitigation.model.architecture import Remnet
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
@@ -141,10 +140,6 @@ def test_file_that_is_not_a_truth_table_is_refused(tmp_path):
     assert caught.value.suggestion == "did you mean 'anchor'?"
 
 
-def run_or_raise(*arguments: object) -> str:
-    return CliRunner().invoke(app, [str(value) for value in arguments], catch_exceptions=False).output
-
-
 EIGHT_PLACES = [f"{place},2,3.0,,,place {place}" for place in range(8)]
 
 
@@ -165,28 +160,27 @@ def loads(monkeypatch, data) -> None:
 
 
 def test_true_ranges_of_a_table_are_used(tmp_path, eight_places):
-    output, result = tmp_path / "own.onnx", tmp_path / "own.json"
-    words = ("--truth", write(tmp_path, *EIGHT_PLACES), "--recipe", "constant", "--folds", 2)
-    run_or_raise("train", "--from-bag", "bag", *words, "-o", output, "--json", result)
-    assert json.loads(result.read_text())["improved"]
-    assert load_bundle(output).card.linear_bias.offset_m == pytest.approx(0.25)
+    write(tmp_path, *EIGHT_PLACES)
+    words = "--truth truth.csv --recipe constant --folds 2 -o own.onnx --json own.json"
+    succeed(f"train --from-bag bag {words}", folder=tmp_path)
+    assert json.loads((tmp_path / "own.json").read_text())["improved"]
+    assert load_bundle(tmp_path / "own.onnx").card.linear_bias.offset_m == pytest.approx(0.25)
 
 
 def test_few_configurations_start_from_the_universal_network(tmp_path, monkeypatch):
     loads(monkeypatch, dataset(6, 3, samples=157))
     far_off = fixed_offset(candidates.CONSTANT, 9.0)
     monkeypatch.setattr(candidates, "new_models", lambda recipe: [far_off])
-    output, result = tmp_path / "cold.onnx", tmp_path / "cold.json"
-    printed = run_or_raise("train", "--data", tmp_path, "-o", output, "--folds", 2, "--json", result)
-    found, made = json.loads(result.read_text()), load_bundle(output)
+    words = "train --data . -o cold.onnx"
+    done = succeed(f"{words} --folds 2 --json cold.json", folder=tmp_path, columns=80)
+    found, made = json.loads((tmp_path / "cold.json").read_text()), load_bundle(tmp_path / "cold.onnx")
     start = load_bundle(default_model_path())
     assert found["choice"]["chosen"] == made.card.training["chosen"] == candidates.COLD_START
     # The mark is in the line of the chosen candidate, also with 80 columns.
-    assert [line for line in printed.splitlines() if "<-" in line and candidates.COLD_START in line]
+    assert [line for line in done.stdout.splitlines() if "<-" in line and candidates.COLD_START in line]
     mae = {row["name"]: row["mae"] for row in found["choice"]["rows"]}
     assert found["improved"] == (mae[NESTED] < mae["raw"])
-    with pytest.raises(ParameterError, match="exists"):
-        run_or_raise("train", "--data", tmp_path, "-o", output)
+    assert "exists" in run(words, folder=tmp_path).stderr
     assert set(found) == {"model_id", "n", "skipped", "rows", "improved", "by_configuration", "choice"}
     inputs = windows(5, 157)
     expected = network_m(float_network(start), inputs)
@@ -197,37 +191,34 @@ def test_harmful_model_is_reported(tmp_path, monkeypatch):
     # Without one of the two configurations with an error of 1 m, the constant is that of the two with -1 m.
     data = dataset(4, 3, samples=8)
     loads(monkeypatch, replace(data, error_m=np.where(np.isin(data.configurations, ("c0", "c1")), 1.0, -1.0)))
-    output, result = tmp_path / "x.onnx", tmp_path / "x.json"
-    words = ("--recipe", "constant", "--samples", 8, "-o", output, "--json", result)
-    assert "not better than measured ranges" in run_or_raise("train", "--data", tmp_path, *words)
-    assert json.loads(result.read_text())["improved"] is False
-    assert load_bundle(output).card.training["recipe"] == {"line": False, "network": False}
+    words = "--recipe constant --samples 8 -o x.onnx --json x.json"
+    assert "not better than measured ranges" in succeed(f"train --data . {words}", folder=tmp_path).stdout
+    assert json.loads((tmp_path / "x.json").read_text())["improved"] is False
+    assert load_bundle(tmp_path / "x.onnx").card.training["recipe"] == {"line": False, "network": False}
 
 
 def test_network_is_compared_with_the_best_baseline(tmp_path, monkeypatch):
     # All ranges have the same error: nothing is better than a constant.
     data = numbered(lambda number: 0.3)
     loads(monkeypatch, data)
-    words = ("--recipe", "network", "--samples", 8, "--epochs", 1, "-o", tmp_path / "x.onnx")
-    printed = " ".join(run_or_raise("train", "--data", tmp_path, *words).split())
-    assert "best baseline, one constant offset: 0.000 m" in printed
-    assert "Warning: the model is not better than one constant offset" in printed
+    words = "--recipe network --samples 8 --epochs 1 -o x.onnx"
+    done = succeed(f"train --data . {words}", folder=tmp_path)
+    assert "best baseline, one constant offset: 0.000 m" in done.stdout
+    assert "Warning: the model is not better than one constant offset" in done.stdout
 
 
 @pytest.mark.parametrize(
-    ("configurations", "arguments", "needed"),
-    [(2, (), "3 or more"), (3, ("--folds", 2), "4 or more"), (1, ("--recipe", "line"), "2 or more")],
+    ("configurations", "options", "needed"),
+    [(2, "", "3 or more"), (3, "--folds 2", "4 or more"), (1, "--recipe line", "2 or more")],
 )
-def test_too_few_configurations_are_refused(tmp_path, monkeypatch, configurations, arguments, needed):
+def test_too_few_configurations_are_refused(tmp_path, monkeypatch, configurations, options, needed):
     loads(monkeypatch, dataset(configurations, 3))
-    with pytest.raises(DatasetError, match=needed):
-        run_or_raise("train", "--data", tmp_path, "-o", tmp_path / "x.onnx", *arguments)
+    assert needed in run(f"train --data . -o x.onnx {options}", folder=tmp_path).stderr
 
 
 def test_data_without_preamble_counts_needs_the_other_scaling(tmp_path, eight_places):
     for item in eight_places:
         object.__setattr__(item.measurement.cir, "preamble_count", 0)
         object.__setattr__(item, "truth", Truth(3.0, configuration=f"{item.measurement.tag_id}"))
-    for command in (("train", "-o", tmp_path / "x.onnx"), ("evaluate", "--cross-validate", "configuration")):
-        with pytest.raises(DatasetError, match="--scaling max"):
-            run_or_raise(*command, "--data", "bag")
+    for command in ("train -o x.onnx", "evaluate --cross-validate configuration"):
+        assert "--scaling max" in run(f"{command} --data bag", folder=tmp_path).stderr

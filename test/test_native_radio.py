@@ -226,17 +226,13 @@ def test_reset_line_is_pulled_low_and_never_driven_high(monkeypatch: pytest.Monk
     assert spi.transfer(b"\x18", None, 2) == b"\x34\x12"
     radio = NativeRadio(spi, RadioSettings())
     try:
-        until = time.monotonic() + GENEROUS_S
-        while not radio.address:
-            assert time.monotonic() < until
-            radio.exchange(0.1)
+        wait_until(lambda: radio.exchange(0.1) or radio.address)
         low = (25, gpio.OUTPUT | gpio.OPEN_DRAIN)
         assert gpio.requests[:3] == [(25, gpio.INPUT), low, (25, gpio.INPUT)]
         assert gpio.chip.fault is None
         spi.reset()
         spi.speed(False)
-        while spi.transfer(b"\x00", None, 4) != bytes.fromhex("3001cade"):
-            assert time.monotonic() < until
+        wait_until(lambda: spi.transfer(b"\x00", None, 4) == bytes.fromhex("3001cade"))
         assert spi.transfer(b"\x18", None, 2) == bytes(2), "a reset takes what was written"
     finally:
         radio.close()

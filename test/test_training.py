@@ -8,10 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import succeed
 from model_material import card, dataset, random_weights, windows
-from typer.testing import CliRunner
 
-from uwb_mitigation.commands.cli import app
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.mitigation.model import floating, graph
 from uwb_mitigation.mitigation.model.architecture import Mlp, Remnet
@@ -176,11 +175,8 @@ def test_bundle_loads_and_runs(tmp_path, shape, quantised):
 
 
 def test_command_writes_both_bundles_with_the_error_by_condition(tmp_path: Path) -> None:
-    words = ["train-universal", "-o", str(tmp_path / "a.onnx"), "--float", str(tmp_path / "b.onnx")]
-    words += ["--samples", "8", "--scaling", "max", "--blocks", "1", "--json", str(tmp_path / "a.json")]
-    words += ["--radio", "dw3000", "--workers", "1"]
-    done = CliRunner().invoke(app, words)
-    assert done.exit_code == 0, done.output
+    words = "--samples 8 --scaling max --blocks 1 --radio dw3000 --workers 1"
+    succeed(f"train-universal -o a.onnx --float b.onnx {words} --json a.json", folder=tmp_path)
     made, floating = (load_bundle(tmp_path / name) for name in ("a.onnx", "b.onnx"))
     assert (made.card.quantised, floating.card.quantised) == (True, False)
     assert made.card.preprocessing.scaling is Scaling.MAX
