@@ -184,10 +184,7 @@ def test_silent_board_gives_a_report(report: Report, tmp_path: Path, monkeypatch
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [
-        (("-o", "earlier.zip"), "exists already"),
-        (("-o", "earlier.zip", "--force"), "is not there"),
-    ],
+    [(("-o", "earlier.zip"), "exists already"), (("-o", "earlier.zip", "--force"), "is not there")],
 )
 def test_invalid_options_are_refused(options: tuple[str, ...], message: str, tmp_path: Path, monkeypatch):
     monkeypatch.chdir(tmp_path)

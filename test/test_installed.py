@@ -162,20 +162,19 @@ def test_node_runs_without_optional_packages(tmp_path: Path, name: str, needed: 
     start_and_end([*without(absent, name), *options], words, tmp_path)
 
 
+REMEDY = "is not installed (run uwb-mitigation doctor)"
+
+
 @pytest.mark.parametrize(
     ("words", "absent", "excerpt"),
     [
-        ("mitigator", "onnxruntime", "onnxruntime is not installed (run uwb-mitigation doctor)"),
-        ("driver", "serial", "pyserial is not installed (run uwb-mitigation doctor)"),
-        ("monitor", "rich", "rich is not installed (run uwb-mitigation doctor)"),
+        ("mitigator", "onnxruntime", f"onnxruntime {REMEDY}"),
+        ("driver", "serial", f"pyserial {REMEDY}"),
+        ("monitor", "rich", f"rich {REMEDY}"),
         ("mitigator", "rclpy", "ROS 2 is not set up: rclpy is missing"),
         ("mitigator", "uwb_mitigation_msgs", "ROS 2 is not set up: uwb_mitigation_msgs is missing"),
-        (
-            "command_line process in.mcap -o out.mcap",
-            "numpy",
-            "numpy is not installed (run uwb-mitigation doctor)",
-        ),
-        ("command_line board export-c -o c", "onnx", "onnx is not installed (run uwb-mitigation doctor)"),
+        ("command_line process in.mcap -o out.mcap", "numpy", f"numpy {REMEDY}"),
+        ("command_line board export-c -o c", "onnx", f"onnx {REMEDY}"),
         ("command_line train --data simulated:ranges=60 -o x.onnx", "torch", "run `make setup-training`"),
     ],
 )

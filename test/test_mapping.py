@@ -631,10 +631,7 @@ def test_all_files_do_not_contain_the_mapping(tmp_path: Path):
     ("text", "message"),
     [
         ("fields: {anchor: a, range: r, rng: r}", r"fields: unknown field .rng.; did you mean 'range'"),
-        (
-            "fields: {anchor: a, range: {column: r, unit: inch}}",
-            "range: unit 'inch'; valid: m, cm, mm",
-        ),
+        ("fields: {anchor: a, range: {column: r, unit: inch}}", "range: unit 'inch'; valid: m, cm, mm"),
         ("fields: {anchor: a, range: {column: r, constant: 1}}", "give one of column"),
         (
             "fields: {stamp: {column: t, unit: iso8601, scale: 2}, anchor: a, range: r}",

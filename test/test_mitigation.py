@@ -128,10 +128,7 @@ def test_invalid_measurement_passes_through_with_its_reason(mitigation, changes,
     assert result.variance_m2 == (0.5 if 0.0 <= range_m <= 1e6 else math.inf)
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [EMPTY, {"preamble_count": 0}, {"first_path_power_dbm": math.nan}, {}],
-)
+@pytest.mark.parametrize("changes", [EMPTY, {"preamble_count": 0}, {"first_path_power_dbm": math.nan}, {}])
 def test_bundle_without_network_ignores_the_cir(tmp_path, changes):
     made = bundle(tmp_path, SHAPE, linear_bias=LinearBiasModel(0.25), needs_cir=False)
     result = Mitigation(made).correct([measurement(3.0, **changes)])[0]

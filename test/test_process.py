@@ -10,8 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_material import Foreign, damage_after_first_chunk, write_records
+from bag_material import START_NS, Foreign, damage_after_first_chunk, write_records
 from command_line import ENVIRONMENT, command, run, start, succeed
+from conftest import REPOSITORY
 from firmware_models import random_measurement
 from model_material import cir
 from port_events import wait_until
@@ -28,9 +29,6 @@ from uwb_mitigation.types.measurement import Encoding, RadioType, RangeMeasureme
 from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets
 from uwb_mitigation.types.ros import codec
 from uwb_mitigation.types.ros.topics import RANGE_CORRECTED, RANGE_RAW
-
-REPOSITORY = Path(__file__).parent.parent
-START_NS = 1_700_000_000_000_000_000
 
 
 def exchange(number: int) -> RangeMeasurement:

@@ -24,11 +24,7 @@ from ros_harness import Process, Ros
 from uwb_mitigation.recordings.recorded_ranges import read_ranges
 from uwb_mitigation.types.anchors import load_anchors
 
-pytestmark = [
-    pytest.mark.ros,
-    pytest.mark.slow,
-    NEEDS_CC,
-]
+pytestmark = [pytest.mark.ros, pytest.mark.slow, NEEDS_CC]
 
 PAGE = REPOSITORY / "docs" / "tutorials" / "your_site.md"
 FENCED = re.compile(r"^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
