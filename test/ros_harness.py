@@ -157,10 +157,10 @@ class Ros:
         self._processes.append(process)
         return process
 
-    def collect(self, kind: type, topic: str, depth: int = 10_000) -> list:
+    def collect(self, kind: type, topic: str, qos: QoSProfile | int = 10_000) -> list:
         """Return a list to which the messages of a topic are appended while the client spins."""
         received: list = []
-        self.node.create_subscription(kind, topic, received.append, QoSProfile(depth=depth))
+        self.node.create_subscription(kind, topic, received.append, qos)
         return received
 
     def spin_until(self, condition: Callable[[], bool], timeout_s: float = TIMEOUT_S) -> None:

@@ -14,11 +14,7 @@ from uwb_mitigation.errors import ModelError
 from uwb_mitigation.mitigation.model import bundle as bundles
 from uwb_mitigation.mitigation.model import graph
 from uwb_mitigation.mitigation.model.architecture import Remnet
-from uwb_mitigation.mitigation.model.bundle import (
-    load_bundle,
-    parse_bundle,
-    save_bundle,
-)
+from uwb_mitigation.mitigation.model.bundle import load_bundle, parse_bundle, save_bundle
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.mitigation.model.shipped import SHIPPED, shipped_model_path
 from uwb_mitigation.types.measurement import RadioType, Segment

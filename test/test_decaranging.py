@@ -11,13 +11,7 @@ import numpy as np
 import pytest
 
 from uwb_mitigation.errors import DamagedRecordingError, RecordingError
-from uwb_mitigation.recordings.decaranging import (
-    Anomaly,
-    CirFrame,
-    DecaRangingFolder,
-    DecaRangingLog,
-    open_decaranging,
-)
+from uwb_mitigation.recordings.decaranging import Anomaly, CirFrame, DecaRangingLog, open_decaranging
 from uwb_mitigation.types.measurement import DEVICE_TICK_HZ, DEVICE_TIME_WRAP, Record, Truth
 
 ANCHOR, TAG = 0x100632205E37FA35, 0x100637205E37FAC2
@@ -279,7 +273,7 @@ def test_folder_gives_truth_and_locations_in_order_of_time(surveyed, inside):
 def test_log_without_a_survey_row_keeps_its_addresses(surveyed, write):
     write(header(), exchange(9.0), name="flat/logs/5.log")
     write(header(), exchange(7.0), name="flat/logs/3.log")
-    folder = DecaRangingFolder(surveyed)
+    folder = open_decaranging(surveyed)
     records = list(folder)
     # If a log exists twice, only the uncompressed one is read.
     assert [record.measurement.range_m for record in records] == [7.0, 2.0, 2.5, 9.0]
@@ -291,7 +285,7 @@ def test_log_without_a_survey_row_keeps_its_addresses(surveyed, write):
 def test_damaged_log_does_not_stop_the_other_logs(surveyed):
     path = surveyed / "logs" / "3.log.xz"
     path.write_bytes(path.read_bytes()[:-30])
-    folder = DecaRangingFolder(surveyed)
+    folder = open_decaranging(surveyed)
     ranges = []
     with pytest.raises(RecordingError) as caught:
         ranges.extend(record.measurement.range_m for record in folder)

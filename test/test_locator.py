@@ -14,13 +14,14 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from drives import HALL, NANOSECONDS, drive
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
+from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 from ros_harness import Ros, corrected_range, diagnostic_values, header_at
 from rosgraph_msgs.msg import Clock
 from tf2_msgs.msg import TFMessage
 from uwb_mitigation_msgs.msg import RangeCorrected
 from visualization_msgs.msg import MarkerArray
 
+from uwb_mitigation.nodes.support.endpoints import LATCHED
 from uwb_mitigation.nodes.support.position_monitor import PositionMonitor
 from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.geometry import Height
@@ -105,16 +106,10 @@ def test_ranges_yield_poses_odometry_smoothed_poses_and_markers(ros: Ros, anchor
     assert float(reported["tag 7 HDOP"]) < 3
     assert reported["tag 7 determination"].startswith("unique: HDOP")
     assert "anchor 4711 are left out" in locator.output
-    late = ros.node.create_subscription(
-        MarkerArray,
-        "/uwb/anchors",
-        (shown := []).append,
-        QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL),
-    )
+    shown = ros.collect(MarkerArray, "/uwb/anchors", LATCHED)
     ros.spin_until(lambda: bool(shown))
     names = {(marker.ns, marker.id) for marker in shown[0].markers}
     assert {("anchors", row) for row in range(len(HALL))} <= names
-    assert late is not None
     # Of a tag that was switched off, nothing that was true before is repeated.
     lost = re.compile(r"Position of tag 9 lost: no ranges of tag 9 for (1[1-9]|[2-9]\d) s")
     status = ros.diagnosis("locator", lambda status: lost.search(status.message) is not None)
@@ -129,21 +124,16 @@ def test_ranges_yield_poses_odometry_smoothed_poses_and_markers(ros: Ros, anchor
     assert locator.signal(signal.SIGINT) == 0, locator.output
 
 
+ALL = [1, 2, 3, 4, 5]
+
+
 @pytest.mark.parametrize(
     ("changes", "anchors", "expected"),
     [
-        ({}, [1, 2, 3, 4, 5], r"good: horizontal sd 0.\d\d m, 95 % within 0.\d\d m"),
-        (
-            {2: 0.5},
-            [1, 2, 3, 4, 5],
-            r"degraded: Anchor 2 reads 0.\d\d m long. Calibrate, or check its position",
-        ),
-        ({5: 0.5}, [1, 2, 3, 4, 5], "good: .*"),
-        (
-            {1: 0.9, 4: -0.9},
-            [1, 2, 3, 4, 5],
-            "degraded: Anchor 1 .*: check height and lever arm of the tag, too",
-        ),
+        ({}, ALL, r"good: horizontal sd 0.\d\d m, 95 % within 0.\d\d m"),
+        ({2: 0.5}, ALL, r"degraded: Anchor 2 reads 0.\d\d m long. Calibrate, or check its position"),
+        ({5: 0.5}, ALL, "good: .*"),
+        ({1: 0.9, 4: -0.9}, ALL, "degraded: Anchor 1 .*: check height and lever arm of the tag, too"),
         (
             {},
             [1, 2],

@@ -10,12 +10,6 @@ from rosbags.highlevel import AnyReader
 
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.recordings.bag import odometry as codec
-from uwb_mitigation.recordings.bag.odometry import (
-    encode_imu_row,
-    encode_odometry_row,
-    read_imu,
-    read_odometry,
-)
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.recordings.mcap import McapRecording
 from uwb_mitigation.simulation import odometry as simulation
@@ -78,7 +72,7 @@ def test_odometry_has_a_scale_error_of_two_percent_drift_and_slip():
 
 
 def test_simulated_drive_contains_odometry_imu_tf_and_the_true_heading(drive: Path):
-    odometry, imu = read_odometry(drive, "/odom"), read_imu(drive, "/imu")
+    odometry, imu = codec.read_odometry(drive, "/odom"), codec.read_imu(drive, "/imu")
     motion = SimulatedSource(seed=1, count=400).motion()
     n = len(odometry)
     # 400 ranges at 20 Hz; it ends with the last range that is received.
@@ -114,21 +108,21 @@ def test_messages_with_invalid_values_are_skipped(tmp_path: Path, monkeypatch: p
     bag = tmp_path / "bag.mcap"
     with BagWriter(bag, {"simulated": "true"}) as out:
         for row in range(3):
-            out.write_message("/odom", ODOMETRY_TYPE, encode_odometry_row(odometry, row), row)
-            out.write_message("/imu", IMU_TYPE, encode_imu_row(imu, row), row)
+            out.write_message("/odom", ODOMETRY_TYPE, codec.encode_odometry_row(odometry, row), row)
+            out.write_message("/imu", IMU_TYPE, codec.encode_imu_row(imu, row), row)
             with monkeypatch.context() as patch:
                 patch.setattr(codec, "UNOBSERVED", -1.0)
-                out.write_message("/no_gyro", IMU_TYPE, encode_imu_row(imu, row), row)
+                out.write_message("/no_gyro", IMU_TYPE, codec.encode_imu_row(imu, row), row)
             broken = replace(odometry, twist=twist * np.nan)
-            out.write_message("/broken", ODOMETRY_TYPE, encode_odometry_row(broken, row), row)
+            out.write_message("/broken", ODOMETRY_TYPE, codec.encode_odometry_row(broken, row), row)
     # The twist is used if the pose is unknown.
-    np.testing.assert_array_equal(read_odometry(bag, "/odom").twist, twist)
-    found = read_imu(bag, "/imu")
+    np.testing.assert_array_equal(codec.read_odometry(bag, "/odom").twist, twist)
+    found = codec.read_imu(bag, "/imu")
     np.testing.assert_allclose(found.yaw, [0.1, np.nan])
     np.testing.assert_allclose(found.yaw_rate_variance, 1.0)
     with pytest.raises(RecordingError, match="/no_gyro: no valid message"):
-        read_imu(bag, "/no_gyro")
+        codec.read_imu(bag, "/no_gyro")
     with pytest.raises(RecordingError, match="/broken: no valid message"):
-        read_odometry(bag, "/broken")
+        codec.read_odometry(bag, "/broken")
     with pytest.raises(RecordingError, match=r"no topic /wheels.*/odom \(nav_msgs/msg/Odometry\)"):
-        read_odometry(bag, "/wheels")
+        codec.read_odometry(bag, "/wheels")

@@ -11,7 +11,9 @@ from rosbags.typesys import Stores, get_typestore
 
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.recordings.bag.pose_paths import read_bodies, read_heights, read_lever_arm
-from uwb_mitigation.types.tracks import PosePath
+from uwb_mitigation.types.ros.poses import encode_pose
+from uwb_mitigation.types.ros.topics import POSE_TYPE
+from uwb_mitigation.types.tracks import Estimate, Heading, PosePath
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 SECONDS = 10
@@ -77,6 +79,13 @@ def test_poses_are_read_from_every_supported_type(tmp_path, topic, make, frames)
     assert path.stamp_ns.tolist() == [second * 10**9 for second in range(SECONDS)]
     assert np.allclose(path.position, [[second, 2.0, 0.5] for second in range(SECONDS)])
     assert np.allclose(np.abs(path.orientation), [0.0, 0.0, 0.0, 1.0])
+
+
+def test_published_covariance_contains_that_of_position_and_yaw():
+    estimate = Estimate(0, np.ones(3), np.zeros(3), np.eye(6), Heading(0.5, np.array([0.1, 0.2, 0.3, 0.4])))
+    pose = STORE.deserialize_cdr(encode_pose(estimate), POSE_TYPE).pose
+    rows = pose.covariance.reshape(6, 6)
+    assert rows[5].tolist() == rows[:, 5].tolist() == [0.1, 0.2, 0.3, 0.0, 0.0, 0.4]
 
 
 def odometry(second: int, child: str = "base_link") -> Any:

@@ -16,12 +16,7 @@ from benchmarks.equipment.dw1000_model.evb1000 import EmulatedEvb1000s
 from benchmarks.equipment.emulated_board import EmulatedBoard
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.radios.parameters import read_radio
-from uwb_mitigation.radios.settings import (
-    AGE_UNKNOWN_MS,
-    AnchorStatus,
-    RadioSettings,
-    RadioStatus,
-)
+from uwb_mitigation.radios.settings import AGE_UNKNOWN_MS, AnchorStatus, RadioSettings, RadioStatus
 from uwb_mitigation.simulation.simulated import SimulatedSource
 
 pytestmark = [pytest.mark.ros, NEEDS_CC]

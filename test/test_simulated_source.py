@@ -18,12 +18,7 @@ from uwb_mitigation.simulation.buildings import PLACEMENTS, block_of
 from uwb_mitigation.simulation.channel import RESIDENTIAL_NLOS, DiffuseField, draw_diffuse_field
 from uwb_mitigation.simulation.radio import Receiver
 from uwb_mitigation.simulation.scene import ROUTE, along_route
-from uwb_mitigation.simulation.simulated import (
-    NOT_RECEIVED,
-    TAG_ID,
-    SimulatedBuildings,
-    SimulatedSource,
-)
+from uwb_mitigation.simulation.simulated import NOT_RECEIVED, TAG_ID, SimulatedBuildings, SimulatedSource
 from uwb_mitigation.training.data.dataset import Dataset, build_dataset
 from uwb_mitigation.training.data.simulated import building_dataset
 from uwb_mitigation.types.measurement import Record

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from uwb_mitigation.simulation import scene
 from uwb_mitigation.simulation.channel import CHANNEL_2, CHANNELS, Multipath, direct_power_db
 from uwb_mitigation.simulation.radio import (
     NOISE_TAPS,
@@ -14,18 +15,6 @@ from uwb_mitigation.simulation.radio import (
     TAPS,
     Receiver,
     pulse,
-)
-from uwb_mitigation.simulation.scene import (
-    BRICK,
-    CONCRETE,
-    FLAT,
-    ROUTE,
-    Building,
-    Screen,
-    Wall,
-    along_route,
-    knife_edge_loss_db,
-    through_slab,
 )
 from uwb_mitigation.simulation.simulated import SimulatedSource
 
@@ -47,23 +36,28 @@ def test_direct_path_loses_free_space_and_obstacles() -> None:
 
 
 def test_wall_delays_by_its_optical_thickness_and_weakens() -> None:
-    loss, excess = through_slab(Wall((0, 0), (0, 1), BRICK, 0.12), np.array([1.0]), CHANNEL_2)
-    assert excess[0] == pytest.approx((math.sqrt(BRICK.permittivity) - 1) * 0.12)
+    loss, excess = scene.through_slab(
+        scene.Wall((0, 0), (0, 1), scene.BRICK, 0.12), np.array([1.0]), CHANNEL_2
+    )
+    assert excess[0] == pytest.approx((math.sqrt(scene.BRICK.permittivity) - 1) * 0.12)
     # ITU-R P.2040-1: attenuation 1636 sigma / sqrt(eps) dB/m, and two faces that reflect 10 % each.
-    absorbed = 1636 * 0.038 / math.sqrt(BRICK.permittivity) * 0.12
+    absorbed = 1636 * 0.038 / math.sqrt(scene.BRICK.permittivity) * 0.12
     assert loss[0] == pytest.approx(absorbed + 0.93, abs=0.02)
 
 
 def test_concrete_attenuates_more_at_a_higher_frequency() -> None:
-    wall = Wall((0, 0), (0, 1), CONCRETE, 0.2)
-    (low, excess), (high, same) = (through_slab(wall, np.array([1.0]), CHANNELS[n]) for n in (2, 5))
+    wall = scene.Wall((0, 0), (0, 1), scene.CONCRETE, 0.2)
+    (low, excess), (high, same) = (scene.through_slab(wall, np.array([1.0]), CHANNELS[n]) for n in (2, 5))
     # The faces reflect 1.47 dB; the conductivity grows with the frequency to the power of 0.8095.
     assert (high - 1.47) / (low - 1.47) == pytest.approx((6489.6 / 3993.6) ** 0.8095, rel=0.01)
     assert excess == same
 
 
 def test_walls_count_only_where_the_line_crosses_them() -> None:
-    plan = Building((4.0, 4.0), (Wall((2, 0), (2, 2), BRICK, 0.1), Wall((3, 0), (3, 2), BRICK, 0.1)))
+    plan = scene.Building(
+        (4.0, 4.0),
+        (scene.Wall((2, 0), (2, 2), scene.BRICK, 0.1), scene.Wall((3, 0), (3, 2), scene.BRICK, 0.1)),
+    )
     a = np.array([[1.0, 1.0], [1.0, 3.0], [2.5, 1.0]])
     b = np.array([[3.5, 1.0], [3.5, 3.0], [3.5, 1.0]])
     path = plan.direct_path(a, b)
@@ -73,23 +67,23 @@ def test_walls_count_only_where_the_line_crosses_them() -> None:
 
 
 def test_path_is_diffracted_at_the_nearer_edge_of_a_screen() -> None:
-    plan = Building((4.0, 4.0), screens=(Screen("cabinet", (2.0, 0.0), (2.0, 1.5)),))
+    plan = scene.Building((4.0, 4.0), screens=(scene.Screen("cabinet", (2.0, 0.0), (2.0, 1.5)),))
     path = plan.direct_path(np.array([[1.0, 1.0]]), np.array([[3.0, 1.0]]))
     detour = 2 * math.hypot(1.0, 0.5) - 2.0
     assert path.excess_m[0] == pytest.approx(detour)
     v = 2 * math.sqrt(detour / 0.0751)
     # Deep in the shadow, the loss is 13 + 20 log10 v.
     assert path.loss_db[0] == pytest.approx(13 + 20 * math.log10(v), abs=0.3)
-    assert knife_edge_loss_db(np.zeros(1), CHANNEL_2)[0] == pytest.approx(6.0, abs=0.1)
+    assert scene.knife_edge_loss_db(np.zeros(1), CHANNEL_2)[0] == pytest.approx(6.0, abs=0.1)
 
 
 def test_robot_stays_inside_the_flat_moves_steadily_and_drives_through_nothing() -> None:
     travelled = np.arange(0.0, 60.0, 0.05)
-    position = along_route(ROUTE, travelled)
-    assert ((position > 0) & (position < FLAT.size)).all()
+    position = scene.along_route(scene.ROUTE, travelled)
+    assert ((position > 0) & (position < scene.FLAT.size)).all()
     step = np.hypot(*np.diff(position, axis=0).T)
     assert step.max() <= 0.05 + 1e-9
-    assert FLAT.direct_path(position[:-1], position[1:]).crossings.max() == 0
+    assert scene.FLAT.direct_path(position[:-1], position[1:]).crossings.max() == 0
 
 
 def test_pulse_has_unit_energy_over_the_taps_and_no_sidelobes() -> None:
