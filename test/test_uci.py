@@ -509,6 +509,9 @@ def test_failed_exchanges_are_explained_by_their_status():
     for cause in list(causes.values())[-4:-1]:
         port.monitor.add_failures(cause, 9, now_s)
     assert "9 of 28 exchanges failed: negative distance: " in port.monitor.warning()
+    packet[4], packet[4 + 27], packet[4 + 29 : 4 + 31] = len(causes), 0, b"\xff\xff"
+    assert port._received(bytes(packet), run.now_ns, run.now_ns) == []
+    assert port.monitor.totals["no distance"] == 1
 
 
 # Sessions --------------------------------------------------------------------------------------------------------
