@@ -75,7 +75,7 @@ def test_scale_follows_the_size_of_the_predicted_error():
 def test_record_becomes_a_row():
     others = {"radio": RadioType.DW3000, "segment": Segment.STS, "channel": 5}
     records = [record(0, "c0"), record(1, "c1", **others), record(2, "c2", rx_power_dbm=-math.inf)]
-    built = build_dataset(records, Preprocessing(157))
+    built = build_dataset(records, Preprocessing())
     _, expected = window_of(records[1].measurement.cir, Preprocessing(157))
     assert np.array_equal(built.inputs[1], expected)
     assert built.error_m.tolist() == [0.25] * 3

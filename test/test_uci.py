@@ -641,6 +641,7 @@ def test_a_second_session_that_is_refused_is_tried_again_while_the_first_ranges(
 def test_a_silent_board_is_started_again_but_a_waiting_anchor_is_not():
     run = Bench(**ANCHOR).start().wait(10.0)
     assert run.session.starts == 1
+    assert b"\x21\x06\0\x04" in run.sent, "GET_SESSION_STATE of FiRa"
     run.board.receive = lambda data, now_s: b""
     assert run.wait(10.0).session.state
 
