@@ -131,7 +131,7 @@ class Browser:
 
         def search() -> Any:
             elements = self.driver.find_elements("css selector", ROLES[role])
-            return next((e for e in elements if e.aria_role == role and e.accessible_name == name), None)
+            return next((e for e in elements if e.accessible_name == name and e.aria_role == role), None)
 
         return self._repeat(search)
 

@@ -255,6 +255,9 @@ def finish(plot: figure, *columns: str) -> None:
         tips = [(name.replace("_", " "), f"@{name}{{0.000}}") for name in columns]
         shown = next(r for r in plot.renderers if isinstance(r.glyph, (models.Line, models.Quad)))
         plot.add_tools(models.HoverTool(tooltips=tips, mode="vline", renderers=[shown]))
+    for layer in plot.renderers:
+        # Nothing is selected or muted: a page without glyphs for that opens faster.
+        layer.update(nonselection_glyph=layer.glyph, selection_glyph=layer.glyph, muted_glyph=layer.glyph)
     for legend in plot.legend:
         if legend in plot.center:
             plot.add_layout(legend, "above")

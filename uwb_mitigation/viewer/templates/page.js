@@ -203,10 +203,13 @@ function start(doc) {
     // What the page shows may be wrong by now.
     $("verdict").style.display = $("intervals").style.display = "none";
     $("age").hidden = true;
-    const wait = setInterval(async () => {
-      try { if ((await fetch(location.href, {cache: "no-store"})).ok) { clearInterval(wait); location.reload(); } }
+    // The script, because the server makes a session for each request of the page; one request at a time.
+    const wait = async () => {
+      try { if ((await fetch(document.querySelector("script[src]").src, {method: "HEAD", cache: "no-store"})).ok) { location.reload(); return; } }
       catch { /* not yet */ }
-    }, 1000);
+      setTimeout(wait, 1000);
+    };
+    setTimeout(wait, 1000);
   });
 }
 const known = setInterval(() => {
