@@ -36,7 +36,7 @@ def export_c(
     bundle = load_bundle(model_path(model))
     if RadioType.DW1000 not in bundle.card.radios:
         trained_for = f"the firmware drives a DW1000, and the model was trained for {bundle.card.source}"
-        raise ModelError(trained_for, where=str(bundle.path), valid="a model for the DW1000")
+        raise ModelError(trained_for, where=bundle.path, valid="a model for the DW1000")
     header = export_bundle(bundle, output)
     result = {
         "header": str(header),

@@ -235,7 +235,7 @@ def _lever_arm_in(
         if math.dist(arm, transforms[0][1]) > MAX_LEVER_ARM_DIFFERENCE_M:
             raise RecordingError(
                 f"the lever arm differs from that in {transforms[0][0]}",
-                where=str(bag),
+                where=bag,
                 valid="--lever-arm, or bags with the antenna at one position",
             )
     return transforms[0][1] if transforms else None

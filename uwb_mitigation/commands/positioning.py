@@ -90,7 +90,7 @@ def track(
     corrector = tracking.mitigation(settings)
     config, recorded = _read(bag, anchors, settings, corrector)
     if not corrector.used and (settings.model or settings.offsets):
-        raise ParameterError("--model or --offsets", where=str(bag), valid="a bag without corrected ranges")
+        raise ParameterError("--model or --offsets", where=bag, valid="a bag without corrected ranges")
     show_models(corrector.used)
     several = len(recorded.tags) > 1
     tum_files = {

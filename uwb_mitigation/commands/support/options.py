@@ -90,7 +90,7 @@ def check_replaceable(files: Iterable[Path], force: bool) -> None:
     """Raise a ParameterError if one of the files exists, unless `force` is set."""
     for file in files:
         if file.exists() and not force:
-            raise ParameterError("exists already", where=str(file), valid="--force replaces it")
+            raise ParameterError("exists already", where=file, valid="--force replaces it")
 
 
 def check_output(output: Path, force: bool = True, suffix: str = ".onnx") -> None:
@@ -101,7 +101,7 @@ def check_output(output: Path, force: bool = True, suffix: str = ".onnx") -> Non
     """
     if (suffix and output.suffix != suffix) or output.is_dir() or not output.resolve().parent.is_dir():
         valid = f"a file {suffix} in an existing folder" if suffix else "a file in an existing folder"
-        raise ParameterError("cannot be written", where=str(output), valid=valid)
+        raise ParameterError("cannot be written", where=output, valid=valid)
     check_replaceable([output], force)
 
 
