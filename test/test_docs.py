@@ -129,6 +129,7 @@ def test_commands_on_pages_exist_with_their_options(start: str, words: list[str]
     while hasattr(command, "commands"):
         assert words[0] in command.commands
         command, words = command.commands[words[0]], words[1:]
+    assert [parameter.name for parameter in command.params if not parameter.help] == []
     names = {name for parameter in command.params for name in (*parameter.opts, *parameter.secondary_opts)}
     assert {word.partition("=")[0] for word in words if word.startswith("-")} <= names | {"--help"}
 

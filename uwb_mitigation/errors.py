@@ -23,10 +23,10 @@ class UwbMitigationError(Exception):
         suggestion: for an unknown name, the question of `did_you_mean`; may be empty.
     """
 
-    def __init__(self, what: str, *, where: str = "", valid: str = "", suggestion: str = "") -> None:
-        super().__init__(what, where, valid, suggestion)
+    def __init__(self, what: str, *, where: object = "", valid: str = "", suggestion: str = "") -> None:
+        super().__init__(what, str(where), valid, suggestion)
         self.what = what
-        self.where = where
+        self.where = str(where)
         self.valid = valid
         self.suggestion = suggestion
 

@@ -19,7 +19,7 @@ def os_errors(kind: type[UwbMitigationError], what: str, where: object, valid: s
     try:
         yield
     except OSError as error:
-        raise kind(f"{what}: {error.strerror}", where=str(where), valid=valid) from error
+        raise kind(f"{what}: {error.strerror}", where=where, valid=valid) from error
 
 
 def read_bounded(path: Path, limit: int, error: type[UwbMitigationError], valid: str = "") -> bytes:
@@ -36,13 +36,13 @@ def read_bounded(path: Path, limit: int, error: type[UwbMitigationError], valid:
     """
     with os_errors(error, "cannot be read", path, valid):
         if not path.is_file():
-            raise error("no such file", where=str(path), valid=valid)
+            raise error("no such file", where=path, valid=valid)
         with path.open("rb") as stream:
             data = stream.read(limit + 1)
     if not data:
-        raise error("the file is empty", where=str(path), valid=valid)
+        raise error("the file is empty", where=path, valid=valid)
     if len(data) > limit:
-        raise error(f"more than {limit} bytes", where=str(path), valid=valid)
+        raise error(f"more than {limit} bytes", where=path, valid=valid)
     return data
 
 
@@ -88,7 +88,7 @@ def write_all_atomically(
             partial.replace(path)
     except (OSError, RuntimeError) as problem:  # a cycle of links is a RuntimeError before Python 3.13
         reason = getattr(problem, "strerror", None) or problem
-        raise error(f"cannot be written: {reason}", where=str(path)) from problem
+        raise error(f"cannot be written: {reason}", where=path) from problem
     finally:
         for partial in partials.values():
             with contextlib.suppress(OSError):

@@ -10,23 +10,23 @@ import typer
 
 from uwb_mitigation.commands.support import console
 from uwb_mitigation.commands.support.console import JsonOption, print_line
-from uwb_mitigation.commands.support.options import check_output, option, output_option
+from uwb_mitigation.commands.support.options import Command, check_output, output_option
 from uwb_mitigation.errors import ModelError
-
-ModelOption = Annotated[Path | None, option("Int8 bundle. Default: the shipped one.", show_default=False)]
 
 app = typer.Typer(help="Build firmware.", no_args_is_help=True)
 
 
-@app.command()
+@app.command(cls=Command)
 def export_c(
-    output: Annotated[Path, output_option("DIR", "Folder for uwb_model.h; created if it does not exist.")],
-    model: ModelOption = None,
-    json: JsonOption = None,
+    output: Annotated[Path, output_option("DIR")], model: Path | None = None, json: JsonOption = None
 ) -> None:
     """Write a model as a C header for the firmware.
 
     It contains weights, constants and golden vectors.
+
+    Options:
+        output: Folder for uwb_model.h; created if it does not exist.
+        model: Int8 bundle. Default: the shipped one.
     """
     from uwb_mitigation.mitigation.embedded.export import GOLDEN_VECTORS, export_bundle
     from uwb_mitigation.mitigation.model.bundle import load_bundle
@@ -36,7 +36,7 @@ def export_c(
     bundle = load_bundle(model_path(model))
     if RadioType.DW1000 not in bundle.card.radios:
         trained_for = f"the firmware drives a DW1000, and the model was trained for {bundle.card.source}"
-        raise ModelError(trained_for, where=str(bundle.path), valid="a model for the DW1000")
+        raise ModelError(trained_for, where=bundle.path, valid="a model for the DW1000")
     header = export_bundle(bundle, output)
     result = {
         "header": str(header),
@@ -49,12 +49,10 @@ def export_c(
     console.write_json(json, result)
 
 
-@app.command()
+@app.command(cls=Command)
 def build_image(
-    output: Annotated[
-        Path, output_option("FILE.hex", "Image file; copy it to the USB drive of the board.")
-    ] = Path("dwm1001-dev.hex"),
-    model: ModelOption = None,
+    output: Annotated[Path, output_option("FILE.hex")] = Path("dwm1001-dev.hex"),
+    model: Path | None = None,
     json: JsonOption = None,
 ) -> None:
     """Build the DWM1001-DEV image as Intel HEX.
@@ -62,6 +60,10 @@ def build_image(
     It contains the ranging firmware with a model that corrects on the board. The board is an anchor unless its host, or
     its button pressed during start-up, makes it a tag. The image has not been run on a board; its driver and
     exchange were tested on a chip model.
+
+    Options:
+        output: Image file; copy it to the USB drive of the board.
+        model: Int8 bundle. Default: the shipped one.
     """
     import tempfile
 

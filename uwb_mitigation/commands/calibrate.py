@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from uwb_mitigation.commands.support import console, options
 from uwb_mitigation.commands.support.console import JsonOption, print_line, show_table, warn
-from uwb_mitigation.commands.support.options import argument, option, output_option
+from uwb_mitigation.commands.support.options import FileOption, argument, option, output_option
 from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError, format_id
 
 if TYPE_CHECKING:
@@ -29,63 +29,18 @@ BASE_FRAME = "base_link"
 
 @options.with_settings("height", "height_sd", "height_topic", "area", "stamp_offset")
 def calibrate(
-    bags: Annotated[
-        list[Path],
-        argument(
-            "BAG...",
-            "Recordings of drives past the anchors: bags, or other formats that `data import` reads.",
-        ),
-    ],
-    output: Annotated[
-        Path, output_option("FILE", "Bundle to write; the offsets are written next to it as X.offsets.yaml.")
-    ],
+    bags: Annotated[list[Path], argument("BAG...")],
+    output: Annotated[Path, output_option("FILE")],
     settings: TrackSettings,
     anchors: options.AnchorsOption = None,
-    truth_topic: Annotated[
-        str | None,
-        option(
-            "Topic of the robot's localisation, used as ground truth: nav_msgs/Odometry, geometry_msgs/PoseStamped or "
-            "PoseWithCovarianceStamped, or /tf.",
-            metavar="TOPIC",
-        ),
-    ] = None,
-    frames: Annotated[
-        tuple[str, str] | None,
-        option("With --truth-topic /tf: frame of the anchors and frame of the robot.", metavar="MAP BASE"),
-    ] = None,
-    time_offset: Annotated[
-        float | None,
-        option("With --truth-topic: time offset added to the stamps of the ranges, s. Default: estimated."),
-    ] = None,
-    lever_arm: Annotated[
-        str | None,
-        option(
-            "With --truth-topic: position of the antenna in the robot's frame, m. Default: the transform in the bag "
-            "to the frame_id of the ranges, otherwise 0.",
-            metavar="X,Y,Z",
-        ),
-    ] = None,
-    estimate_lever_arm: Annotated[
-        bool,
-        option(
-            "With --truth-topic: estimate the lever arm, starting from the given one. Needs a drive with turns.",
-            "--estimate-lever-arm",
-        ),
-    ] = False,
-    check: Annotated[
-        list[Path] | None,
-        option(
-            "Recording of another drive at the same site, on which the calibration is only tested; may be repeated.",
-            metavar="BAG",
-        ),
-    ] = None,
-    report: Annotated[
-        Path | None, option("Also write an HTML page with the results.", metavar="FILE")
-    ] = None,
-    force: Annotated[
-        bool,
-        option("Replace existing files, and write a calibration that does not reduce the errors.", "--force"),
-    ] = False,
+    truth_topic: Annotated[str | None, option(metavar="TOPIC")] = None,
+    frames: Annotated[tuple[str, str] | None, option(metavar="MAP BASE")] = None,
+    time_offset: float | None = None,
+    lever_arm: Annotated[str | None, option(metavar="X,Y,Z")] = None,
+    estimate_lever_arm: bool = False,
+    check: Annotated[list[Path] | None, option(metavar="BAG")] = None,
+    report: FileOption = None,
+    force: bool = False,
     json: JsonOption = None,
 ) -> None:
     """Calibrate a site from a drive, without surveyed positions.
@@ -96,6 +51,21 @@ def calibrate(
         uwb-mitigation calibrate drive.mcap --anchors anchors.yaml --height 0.4 -o site.onnx
 
         uwb-mitigation process other.mcap --model site.onnx --offsets site.offsets.yaml -o corrected.mcap
+
+    Options:
+        bags: Recordings of drives past the anchors: bags, or other formats that `data import` reads.
+        output: Bundle to write; the offsets are written next to it as X.offsets.yaml.
+        truth_topic: Topic of the robot's localisation, used as ground truth: nav_msgs/Odometry,
+            geometry_msgs/PoseStamped or PoseWithCovarianceStamped, or /tf.
+        frames: With --truth-topic /tf: frame of the anchors and frame of the robot.
+        time_offset: With --truth-topic: time offset added to the stamps of the ranges, s. Default: estimated.
+        lever_arm: With --truth-topic: position of the antenna in the robot's frame, m. Default: the transform in the
+            bag to the frame_id of the ranges, otherwise 0.
+        estimate_lever_arm: With --truth-topic: estimate the lever arm, starting from the given one. Needs a drive with
+            turns.
+        check: Recording of another drive at the same site, on which the calibration is only tested; may be repeated.
+        report: Also write an HTML page with the results.
+        force: Replace existing files, and write a calibration that does not reduce the errors.
     """
     from uwb_mitigation.calibration.site import calibrate_site, offsets_file
     from uwb_mitigation.calibration.solution import Localisation, solve_with_truth, solve_without_truth
@@ -265,7 +235,7 @@ def _lever_arm_in(
         if math.dist(arm, transforms[0][1]) > MAX_LEVER_ARM_DIFFERENCE_M:
             raise RecordingError(
                 f"the lever arm differs from that in {transforms[0][0]}",
-                where=str(bag),
+                where=bag,
                 valid="--lever-arm, or bags with the antenna at one position",
             )
     return transforms[0][1] if transforms else None

@@ -25,6 +25,7 @@ from uwb_mitigation.commands import (
     view,
 )
 from uwb_mitigation.commands.support import console
+from uwb_mitigation.commands.support.options import Command
 from uwb_mitigation.errors import ParameterError, UwbMitigationError, missing_dependency
 
 PANELS: dict[str, dict[str, typer.Typer | Callable[..., None]]] = {
@@ -64,7 +65,7 @@ for _panel, _commands in PANELS.items():
         if isinstance(_command, typer.Typer):
             app.add_typer(_command, name=_name, rich_help_panel=_panel)
         else:
-            app.command(_name, rich_help_panel=_panel)(_command)
+            app.command(_name, cls=Command, rich_help_panel=_panel)(_command)
 
 
 def _print_version(is_set: bool) -> None:

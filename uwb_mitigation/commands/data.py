@@ -13,7 +13,7 @@ import typer
 
 from uwb_mitigation.commands.support import console
 from uwb_mitigation.commands.support.console import JsonOption, print_line, show_table
-from uwb_mitigation.commands.support.options import argument, option, output_option
+from uwb_mitigation.commands.support.options import Command, argument, option, output_option
 from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError, check_name
 from uwb_mitigation.types.stamps import NS_PER_S
 
@@ -27,29 +27,31 @@ app = typer.Typer(help="Import, simulate and show recordings.", no_args_is_help=
 
 _LONGEST_PAUSE_S = 5.0
 
-CirOption = Annotated[Literal["final", "poll"], option("Frame of a DecaRanging exchange whose CIR is used.")]
-OUTPUT = output_option("OUT", "OUT.mcap for one file, any other name for a bag folder.")
-ForceOption = Annotated[bool, option("Replace OUT if it exists.", "--force")]
+CirName = Literal["final", "poll"]
 
 
-@app.command("import")
+@app.command("import", cls=Command)
 def import_recordings(
-    sources: Annotated[list[Path], argument("SRC...", "Recordings: logs, folders, bags.")],
-    output: Annotated[Path | None, OUTPUT] = None,
-    mapping: Annotated[
-        str, option("Mapping file for other formats, or a shipped name.", "--map", metavar="FILE")
-    ] = "",
-    dry_run: Annotated[
-        bool, option("With --map: show how the recording is understood; write nothing.", "--dry-run")
-    ] = False,
-    cir: CirOption = "final",
-    longest_pause: Annotated[
-        float, option("Longer pauses are shortened to this; inf: never.", metavar="SECONDS")
-    ] = _LONGEST_PAUSE_S,
-    force: ForceOption = False,
+    sources: Annotated[list[Path], argument("SRC...")],
+    output: Annotated[Path | None, output_option("OUT")] = None,
+    mapping: Annotated[str, typer.Option("--map", metavar="FILE")] = "",
+    dry_run: bool = False,
+    cir: CirName = "final",
+    longest_pause: Annotated[float, option(metavar="SECONDS")] = _LONGEST_PAUSE_S,
+    force: bool = False,
     json: JsonOption = None,
 ) -> None:
-    """Write recordings into one MCAP bag, with truth where known."""
+    """Write recordings into one MCAP bag, with truth where known.
+
+    Options:
+        sources: Recordings: logs, folders, bags.
+        output: OUT.mcap for one file, any other name for a bag folder.
+        mapping: Mapping file for other formats, or a shipped name.
+        dry_run: With --map: show how the recording is understood; write nothing.
+        cir: Frame of a DecaRanging exchange whose CIR is used.
+        longest_pause: Longer pauses are shortened to this; inf: never.
+        force: Replace OUT if it exists.
+    """
     from uwb_mitigation.commands.support import mapped_report
     from uwb_mitigation.recordings.bag.writer import check_bag_output
     from uwb_mitigation.recordings.formats import open_mapped
@@ -76,30 +78,33 @@ def import_recordings(
     _write(opened, output, math.inf if in_motion else longest_pause, force, json, extra=extra)
 
 
-@app.command()
+@app.command(cls=Command)
 def simulate(
-    output: Annotated[Path, OUTPUT],
-    like: Annotated[
-        Literal["drive", "buildings"],
-        option(
-            "drive: a robot that drives through a flat; buildings: static placements in random buildings, with "
-            "different boards."
-        ),
-    ] = "drive",
-    seed: Annotated[int, option("Seed. Stamps start today at 0:00 UTC.")] = 1,
-    ranges: Annotated[
-        int, option("Number of ranges, including those that are too weak to be received.")
-    ] = 20_000,
-    exchanges: Annotated[int, option("Exchanges of each static placement (buildings).")] = 20,
-    anchors: Annotated[int, option("Number of anchors of a drive, 4 to 8.")] = 4,
-    channel: Annotated[int, option("UWB channel: 1 to 5, or 7.")] = 2,
-    force: ForceOption = False,
+    output: Annotated[Path, output_option("OUT")],
+    like: Literal["drive", "buildings"] = "drive",
+    seed: int = 1,
+    ranges: int = 20_000,
+    exchanges: int = 20,
+    anchors: int = 4,
+    channel: int = 2,
+    force: bool = False,
     json: JsonOption = None,
 ) -> None:
     """Simulate ranges with their truth, and write them to a bag.
 
     The bag is marked as simulated. A drive also contains `/odom`, `/imu` and `/tf` (odom to base_link) of the robot,
     with a scale error of 2 %, drift and slip. The antenna of the tag is at the origin of base_link.
+
+    Options:
+        output: OUT.mcap for one file, any other name for a bag folder.
+        like: drive: a robot that drives through a flat; buildings: static placements in random buildings, with different
+            boards.
+        seed: Seed. Stamps start today at 0:00 UTC.
+        ranges: Number of ranges, including those that are too weak to be received.
+        exchanges: Exchanges of each static placement (buildings).
+        anchors: Number of anchors of a drive, 4 to 8.
+        channel: UWB channel: 1 to 5, or 7.
+        force: Replace OUT if it exists.
     """
     source = simulated_source(like, seed, ranges, exchanges, anchors, channel)
     write_simulated(source, ranges, seed, output, force, json)
@@ -231,7 +236,7 @@ def simulated_source(like: str, seed: int, ranges: int, exchanges: int, anchors:
     return SimulatedSource.with_anchors(anchors, seed=seed, count=ranges, channel=CHANNELS[channel])
 
 
-def _open(path: Path, cir: Literal["final", "poll"]) -> Source:
+def _open(path: Path, cir: CirName) -> Source:
     """Open any recording, including DeepUWB's pickle; raises the errors of `open_recording`."""
     from uwb_mitigation.recordings.formats import open_recording
 
@@ -242,13 +247,14 @@ def _open(path: Path, cir: Literal["final", "poll"]) -> Source:
     return open_recording(path, cir=cir)
 
 
-@app.command()
-def info(
-    path: Annotated[Path, argument("PATH", "A recording: log, folder or bag.")],
-    cir: CirOption = "final",
-    json: JsonOption = None,
-) -> None:
-    """Show the contents of a recording: pairs, counts, warnings."""
+@app.command(cls=Command)
+def info(path: Annotated[Path, argument("PATH")], cir: CirName = "final", json: JsonOption = None) -> None:
+    """Show the contents of a recording: pairs, counts, warnings.
+
+    Options:
+        path: A recording: log, folder or bag.
+        cir: Frame of a DecaRanging exchange whose CIR is used.
+    """
     from uwb_mitigation.recordings.mcap import McapRecording
     from uwb_mitigation.recordings.summary import RecordingSummary
 

@@ -36,23 +36,14 @@ if TYPE_CHECKING:
 
 
 def field_report(
-    source: Annotated[Literal["uci", "evb1000", "spi", "serial", "lines", "pans"], option("Kind of radio.")],
-    port: Annotated[
-        str,
-        option("Port of the tag, and of an anchor at this computer.", metavar="P[,P2]"),
-    ],
-    distance: Annotated[float, option("Distance between the antennas, m.")],
-    output: Annotated[Path, output_option("FILE.zip", "File to attach to an issue.")] = Path(
-        "field_report.zip"
-    ),
-    mapping: Annotated[
-        str, option("Mapping for the source lines, as for the driver.", "--map", metavar="MAPPING")
-    ] = "",
-    seconds: Annotated[float, option("Duration of the measurement.", min=2.0, max=3600.0)] = 300.0,
-    unplug: Annotated[
-        bool, option("Test unplugging and reconnecting the first port.", "--unplug/--no-unplug")
-    ] = True,
-    force: Annotated[bool, option("Replace FILE.zip if it exists.", "--force")] = False,
+    source: Annotated[Literal["uci", "evb1000", "spi", "serial", "lines", "pans"], option()],
+    port: Annotated[str, option(metavar="P[,P2]")],
+    distance: Annotated[float, option()],
+    output: Annotated[Path, output_option("FILE.zip")] = Path("field_report.zip"),
+    mapping: Annotated[str, typer.Option("--map", metavar="MAPPING")] = "",
+    seconds: Annotated[float, option(min=2.0, max=3600.0)] = 300.0,
+    unplug: bool = True,
+    force: bool = False,
     json: JsonOption = None,
 ) -> None:
     """Test a pair of radios at a known distance and write a report.
@@ -63,6 +54,16 @@ def field_report(
     The exit code is 1 if a check fails.
 
         uwb-mitigation field-report --source uci --port /dev/ttyACM0 --distance 3
+
+    Options:
+        source: Kind of radio.
+        port: Port of the tag, and of an anchor at this computer.
+        distance: Distance between the antennas, m.
+        output: File to attach to an issue.
+        mapping: Mapping for the source lines, as for the driver.
+        seconds: Duration of the measurement.
+        unplug: Test unplugging and reconnecting the first port.
+        force: Replace FILE.zip if it exists.
     """
     if not 0.1 <= distance <= 500.0:
         raise ParameterError(f"--distance {distance}", valid="0.1 to 500 m")

@@ -8,6 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import typer
+
 from uwb_mitigation.commands.support import console, model_tables, options
 from uwb_mitigation.commands.support.bundles import show_models
 from uwb_mitigation.commands.support.console import JsonOption
@@ -18,34 +20,21 @@ if TYPE_CHECKING:
     from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
     from uwb_mitigation.training.data.dataset import Dataset
 
-_DATA_HELP = "Recording with true ranges: a bag, or a folder of DecaRanging logs."
-OutputOption = Annotated[Path, options.output_option("FILE", "Bundle to write.")]
+OutputOption = Annotated[Path, options.output_option("FILE")]
 
 
 def train(
     output: OutputOption,
-    data: Annotated[Path, option(_DATA_HELP, "--data", "--from-bag")],
-    truth: Annotated[
-        list[Path] | None,
-        option(
-            "True ranges of the pairs (tag_id, anchor_id, range_m, and optionally start_s, stop_s, configuration, "
-            "label) instead of those of the recording; may be given several times.",
-            metavar="CSV",
-        ),
-    ] = None,
-    recipe_name: Annotated[
-        Literal["auto", "constant", "line", "line+network", "network"],
-        option("Kind of model; auto: selected by cross-validation.", "--recipe"),
-    ] = "auto",
-    samples: Annotated[int, option("Window length K.")] = 157,
-    scaling: Annotated[
-        options.ScalingName, option("Scaling of the CIR by its preamble count, or by its maximum.")
-    ] = "preamble",
-    epochs: Annotated[int | None, option("Passes over the data.")] = None,
-    learning_rate: Annotated[float | None, option("Learning rate of Adam.")] = None,
-    seed: Annotated[int, option("Seed of the splits, the initial weights and the order of the data.")] = 0,
-    folds: Annotated[int, option("Number of folds of the cross-validation.")] = 6,
-    force: Annotated[bool, option("Replace FILE if it exists.", "--force")] = False,
+    data: Annotated[Path, typer.Option("--data", "--from-bag")],
+    truth: Annotated[list[Path] | None, option(metavar="CSV")] = None,
+    recipe: Literal["auto", "constant", "line", "line+network", "network"] = "auto",
+    samples: int = 157,
+    scaling: options.ScalingName = "preamble",
+    epochs: int | None = None,
+    learning_rate: float | None = None,
+    seed: int = 0,
+    folds: int = 6,
+    force: bool = False,
     json: JsonOption = None,
 ) -> None:
     """Train a float bundle; the amount of data determines the complexity of the model.
@@ -56,6 +45,20 @@ def train(
     It is preferred with fewer than 20 configurations. With 20 or more, its mean with the linear bias model is another
     candidate. It is not used with --recipe. A network trained on the data is selected only if it reduces
     the error on held-out data.
+
+    Options:
+        output: Bundle to write.
+        data: Recording with true ranges: a bag, or a folder of DecaRanging logs.
+        truth: True ranges of the pairs (tag_id, anchor_id, range_m, and optionally start_s, stop_s, configuration, label)
+            instead of those of the recording; may be given several times.
+        recipe: Kind of model; auto: selected by cross-validation.
+        samples: Window length K.
+        scaling: Scaling of the CIR by its preamble count, or by its maximum.
+        epochs: Passes over the data.
+        learning_rate: Learning rate of Adam.
+        seed: Seed of the splits, the initial weights and the order of the data.
+        folds: Number of folds of the cross-validation.
+        force: Replace FILE if it exists.
     """
     from uwb_mitigation.mitigation.model.architecture import Remnet
     from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
@@ -69,30 +72,25 @@ def train(
     from uwb_mitigation.training.fit import candidates, fitting  # noqa: F401  (imports torch)
 
     name, dataset = _dataset(data, Preprocessing(samples, Scaling(scaling)), truth or ())
-    recipe = candidates.Recipe(architecture, fit_options, replace(candidates.NETWORK_ONLY, **set_options))
+    network_only = replace(candidates.NETWORK_ONLY, **set_options)
     with console.stage_bars() as on_progress:
         job = training.TrainingJob(dataset, name, output, folds, on_progress)
-        trained = training.train_new_model(job, recipe, recipe_name)
+        parts = candidates.Recipe(architecture, fit_options, network_only)
+        trained = training.train_new_model(job, parts, recipe)
     model_tables.show_trained(trained)
     console.write_json(json, trained)
 
 
 def train_universal(
-    output: Annotated[Path, options.output_option("FILE", "int8 bundle to write.")],
-    seed: Annotated[int, option("Seed of the simulated buildings and of the network.", min=0, max=2**31)] = 0,
-    samples: Annotated[int, option("Window length K.")] = 157,
-    scaling: Annotated[options.ScalingName, option("max: for windows without preamble counts.")] = "preamble",
-    radio: Annotated[Literal["dw1000", "dw3000"], option("dw3000: for windows of an STS.")] = "dw1000",
-    blocks: Annotated[
-        int | None, option("Number of blocks of 256 placements for training.", min=1, max=10_000)
-    ] = None,
-    float_output: Annotated[
-        Path | None, option("Also write the float bundle.", "--float", metavar="FILE")
-    ] = None,
-    workers: Annotated[
-        int | None, option("Processes of the simulation; default: one per processor.", min=1, max=256)
-    ] = None,
-    force: Annotated[bool, option("Replace files that exist.", "--force")] = False,
+    output: OutputOption,
+    seed: Annotated[int, option(min=0, max=2**31)] = 0,
+    samples: int = 157,
+    scaling: options.ScalingName = "preamble",
+    radio: Literal["dw1000", "dw3000"] = "dw1000",
+    blocks: Annotated[int | None, option(min=1, max=10_000)] = None,
+    float_output: Annotated[Path | None, typer.Option("--float", metavar="FILE")] = None,
+    workers: Annotated[int | None, option(min=1, max=256)] = None,
+    force: bool = False,
     json: JsonOption = None,
 ) -> None:
     """Train a model for unknown sites in simulated buildings.
@@ -104,6 +102,17 @@ def train_universal(
         uwb-mitigation train-universal --seed 0 -o universal.onnx
 
         uwb-mitigation train-universal --scaling max -o amplitude.onnx
+
+    Options:
+        output: int8 bundle to write.
+        seed: Seed of the simulated buildings and of the network.
+        samples: Window length K.
+        scaling: max: for windows without preamble counts.
+        radio: dw3000: for windows of an STS.
+        blocks: Number of blocks of 256 placements for training.
+        float_output: Also write the float bundle.
+        workers: Processes of the simulation; default: one per processor.
+        force: Replace files that exist.
     """
     from uwb_mitigation.mitigation.model import graph
     from uwb_mitigation.mitigation.model.bundle import save_bundle
@@ -138,15 +147,21 @@ def train_universal(
 
 
 def quantise(
-    model: Annotated[Path, argument("MODEL_FLOAT", "Float bundle, as `train` or `--float` writes it.")],
-    data: Annotated[Path, option("Recording with CIRs, best the training data; true ranges are not needed.")],
+    model: Annotated[Path, argument("MODEL_FLOAT")],
+    data: Annotated[Path, option()],
     output: OutputOption,
-    force: Annotated[bool, option("Replace FILE if it exists.", "--force")] = False,
+    force: bool = False,
     json: JsonOption = None,
 ) -> None:
     """Quantise a float bundle to int8.
 
     Its training data determine the scales of the activations.
+
+    Options:
+        model: Float bundle, as `train` or `--float` writes it.
+        data: Recording with CIRs, best the training data; true ranges are not needed.
+        output: Bundle to write.
+        force: Replace FILE if it exists.
     """
     from uwb_mitigation.mitigation.model.bundle import load_bundle
     from uwb_mitigation.training.data import recordings
@@ -176,34 +191,26 @@ def quantise(
     )
 
 
-def _cross_validation(description: str, default: str, **limits: Any) -> Any:
-    """Return an option of `evaluate --cross-validate`, which is an error without it."""
-    text = f"With --cross-validate: {description} Default: {default}."
-    return option(text, show_default=False, **limits)
-
-
 def evaluate(
-    data: Annotated[Path, option(_DATA_HELP)],
+    data: Annotated[Path, option()],
     model: options.ModelOption = None,
     offsets: options.OffsetsOption = None,
-    cross_validate: Annotated[
-        Literal["configuration"] | None,
-        option(
-            "Instead of evaluating a model: fit the shipped recipe and the baselines, and test them on held-out "
-            "placements (configuration)."
-        ),
-    ] = None,
-    seeds: Annotated[
-        int | None,
-        _cross_validation("number of repetitions with other splits and networks.", "3", min=1, max=100),
-    ] = None,
-    folds: Annotated[int | None, _cross_validation("number of folds.", "6")] = None,
-    scaling: Annotated[
-        options.ScalingName | None, _cross_validation("max for data without preamble counts.", "preamble")
-    ] = None,
+    cross_validate: Literal["configuration"] | None = None,
+    seeds: Annotated[int | None, option(min=1, max=100)] = None,
+    folds: int | None = None,
+    scaling: options.ScalingName | None = None,
     json: JsonOption = None,
 ) -> None:
-    """Compute the errors of raw and corrected ranges in a recording with ground truth."""
+    """Compute the errors of raw and corrected ranges in a recording with ground truth.
+
+    Options:
+        data: Recording with true ranges: a bag, or a folder of DecaRanging logs.
+        cross_validate: Instead of evaluating a model: fit the shipped recipe and the baselines, and test them on held-out
+            placements (configuration).
+        seeds: With --cross-validate: number of repetitions with other splits and networks. Default: 3.
+        folds: With --cross-validate: number of folds. Default: 6.
+        scaling: With --cross-validate: max for data without preamble counts. Default: preamble.
+    """
     unused: dict[str, object] = {"--offsets": offsets, "--model": model}
     mode, valid = "with", "one of them: cross-validation fits new models"
     if cross_validate is None:

@@ -21,22 +21,15 @@ MAX_DISTANCE_M = 1000.0
 
 
 def offset(
-    bag: Annotated[Path, argument("BAG", "Ranges in line of sight: a bag, or a folder of DecaRanging logs.")],
-    distance: Annotated[float | None, option("True distance between the antennas, m.", metavar="M")] = None,
-    truth: Annotated[
-        bool, option("Instead of --distance: use the true distances in the recording.", "--truth")
-    ] = False,
-    anchor: Annotated[str | None, option("Only ranges of this anchor.", metavar="ID")] = None,
-    tag: Annotated[str | None, option("Only ranges of this tag.", metavar="ID")] = None,
+    bag: Annotated[Path, argument("BAG")],
+    distance: Annotated[float | None, option(metavar="M")] = None,
+    truth: bool = False,
+    anchor: Annotated[str | None, option(metavar="ID")] = None,
+    tag: Annotated[str | None, option(metavar="ID")] = None,
     model: ModelOption = None,
-    output: Annotated[
-        Path | None,
-        output_option("FILE", "File to write, for --offsets and the parameter `offsets` of the nodes."),
-    ] = None,
-    common: Annotated[
-        bool, option("Write one offset, if the same boards were at several positions.", "--common")
-    ] = False,
-    force: Annotated[bool, option("Replace files that exist.", "--force")] = False,
+    output: Annotated[Path | None, output_option("FILE")] = None,
+    common: bool = False,
+    force: bool = False,
     json: JsonOption = None,
 ) -> None:
     """Estimate the range offset due to the antenna delays.
@@ -47,6 +40,16 @@ def offset(
 
         uwb-mitigation offset los.mcap --distance 5.00 -o offsets.yaml
         ros2 param set /mitigator offsets offsets.yaml
+
+    Options:
+        bag: Ranges in line of sight: a bag, or a folder of DecaRanging logs.
+        distance: True distance between the antennas, m.
+        truth: Instead of --distance: use the true distances in the recording.
+        anchor: Only ranges of this anchor.
+        tag: Only ranges of this tag.
+        output: File to write, for --offsets and the parameter `offsets` of the nodes.
+        common: Write one offset, if the same boards were at several positions.
+        force: Replace files that exist.
     """
     from uwb_mitigation.calibration import radio_offsets
     from uwb_mitigation.files import write_atomically

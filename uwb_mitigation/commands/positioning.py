@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 from uwb_mitigation.commands.support import console, options
 from uwb_mitigation.commands.support.bundles import show_models
 from uwb_mitigation.commands.support.console import JsonOption, print_line, show_table, warn
-from uwb_mitigation.commands.support.options import argument, check_replaceable, option, output_option
+from uwb_mitigation.commands.support.options import (
+    FileOption,
+    argument,
+    check_replaceable,
+    option,
+    output_option,
+)
 from uwb_mitigation.errors import ParameterError, check_name, format_id
 
 if TYPE_CHECKING:
@@ -42,25 +48,17 @@ TRACK_COLUMNS = {
     "epochs": "epochs:d",
 }
 
-BagArgument = Annotated[Path, argument("BAG", "An MCAP bag with ranges, corrected or raw.")]
-
 
 @options.with_settings()
 def track(
-    bag: BagArgument,
-    output: Annotated[Path, output_option("OUT", "OUT.mcap for one file, any other name for a folder.")],
+    bag: Annotated[Path, argument("BAG")],
+    output: Annotated[Path, output_option("OUT")],
     settings: TrackSettings,
     anchors: options.AnchorsOption = None,
-    tum: Annotated[
-        Path | None, option("Also write the smoothed track in TUM's format, as evo reads it.", metavar="FILE")
-    ] = None,
-    report: Annotated[
-        Path | None, option("Also write an HTML page: verdict, map, errors over time.", metavar="FILE")
-    ] = None,
-    png: Annotated[
-        Path | None, option("Also draw a map of the tracks (needs matplotlib).", metavar="FILE")
-    ] = None,
-    force: Annotated[bool, option("Replace what exists.", "--force")] = False,
+    tum: FileOption = None,
+    report: FileOption = None,
+    png: FileOption = None,
+    force: bool = False,
     json: JsonOption = None,
 ) -> None:
     """Estimate the tracks of a recording's tags: filtered and smoothed.
@@ -74,6 +72,14 @@ def track(
         uwb-mitigation track a1.mcap -o a1_track.mcap --stamp-offset=-0.2
 
         uwb-mitigation track drive.mcap -o track.mcap --odometry /odom --imu /imu
+
+    Options:
+        bag: An MCAP bag with ranges, corrected or raw.
+        output: OUT.mcap for one file, any other name for a folder.
+        tum: Also write the smoothed track in TUM's format, as evo reads it.
+        report: Also write an HTML page: verdict, map, errors over time.
+        png: Also draw a map of the tracks (needs matplotlib).
+        force: Replace what exists.
     """
     from uwb_mitigation.commands.offline import track as tracking
     from uwb_mitigation.files import write_atomically
@@ -84,7 +90,7 @@ def track(
     corrector = tracking.mitigation(settings)
     config, recorded = _read(bag, anchors, settings, corrector)
     if not corrector.used and (settings.model or settings.offsets):
-        raise ParameterError("--model or --offsets", where=str(bag), valid="a bag without corrected ranges")
+        raise ParameterError("--model or --offsets", where=bag, valid="a bag without corrected ranges")
     show_models(corrector.used)
     several = len(recorded.tags) > 1
     tum_files = {
@@ -124,16 +130,13 @@ def track(
 
 @options.with_settings("height", "height_sd", "height_topic", "area", "stamp_offset", "acceleration")
 def survey(
-    bag: BagArgument,
-    output: Annotated[Path, output_option("FILE", "The anchors file to write.")],
+    bag: Annotated[Path, argument("BAG")],
+    output: Annotated[Path, output_option("FILE")],
     settings: TrackSettings,
     anchors: options.AnchorsOption = None,
-    off: Annotated[float, option("Standard deviation of the guesses in FILE, m in each coordinate.")] = 1.0,
-    fixed: Annotated[
-        list[str] | None,
-        option("An anchor that is where FILE says; may be repeated.", "--fixed", metavar="ID"),
-    ] = None,
-    force: Annotated[bool, option("Replace FILE if it exists.", "--force")] = False,
+    off: float = 1.0,
+    fixed: Annotated[list[str] | None, option(metavar="ID")] = None,
+    force: bool = False,
     json: JsonOption = None,
 ) -> None:
     """Estimate anchor positions from rough guesses and a drive past them.
@@ -141,6 +144,13 @@ def survey(
     Drive a loop of a minute or more that passes every anchor on more than one side. The output names anchors that are
     not at the position in the file, and swapped pairs. Translation and rotation of all anchors are unobservable from
     ranges: they come from the guesses, or from anchors that are `--fixed`.
+
+    Options:
+        bag: An MCAP bag with ranges, corrected or raw.
+        output: The anchors file to write.
+        off: Standard deviation of the guesses in FILE, m in each coordinate.
+        fixed: An anchor that is where FILE says; may be repeated.
+        force: Replace FILE if it exists.
     """
     from uwb_mitigation.calibration.survey import survey_anchors
     from uwb_mitigation.types.anchors import save_anchors

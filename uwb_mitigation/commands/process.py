@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import typer
 from rich.markup import escape
 
 from uwb_mitigation.commands.support import console, options
@@ -22,28 +23,25 @@ if TYPE_CHECKING:
 
 
 def process(
-    sources: Annotated[list[Path], argument("IN...", "Bags, or folders of bags at any depth.")],
-    output: Annotated[
-        Path,
-        output_option(
-            "OUT",
-            "For one bag: OUT.mcap for one file, any other name for a bag folder. For several bags: a folder.",
-        ),
-    ],
+    sources: Annotated[list[Path], argument("IN...")],
+    output: Annotated[Path, output_option("OUT")],
     model: options.ModelOption = None,
     offsets: options.OffsetsOption = None,
-    workers: Annotated[
-        int | None, option("Bags processed at the same time. Default: number of cores.", "-j", "--jobs")
-    ] = None,
-    scheduler: Annotated[
-        str | None, option("Address of the scheduler of a Dask cluster: tcp://HOST:8786.", metavar="ADDRESS")
-    ] = None,
-    force: Annotated[bool, option("Replace outputs that exist.", "--force")] = False,
+    workers: Annotated[int | None, typer.Option("-j", "--jobs")] = None,
+    scheduler: Annotated[str | None, option(metavar="ADDRESS")] = None,
+    force: bool = False,
     json: JsonOption = None,
 ) -> None:
     """Copy bags and add a corrected range after each raw one.
 
     All other messages are unchanged.
+
+    Options:
+        sources: Bags, or folders of bags at any depth.
+        output: For one bag: OUT.mcap for one file, any other name for a bag folder. For several bags: a folder.
+        workers: Bags processed at the same time. Default: number of cores.
+        scheduler: Address of the scheduler of a Dask cluster: tcp://HOST:8786.
+        force: Replace outputs that exist.
     """
     from uwb_mitigation.commands.offline import parallel
     from uwb_mitigation.commands.offline.process import Job

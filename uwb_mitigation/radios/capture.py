@@ -142,7 +142,7 @@ class Capture(Source):
         with self._open() as file:
             if file.readline(len(first_line(kind)) + 2).rstrip("\r\n") != first_line(kind):
                 valid = "a file of parameter capture"
-                raise RecordingError(f"not a capture of source {kind.lower()}", where=str(path), valid=valid)
+                raise RecordingError(f"not a capture of source {kind.lower()}", where=path, valid=valid)
 
     def __iter__(self) -> Iterator[Record]:
         self.skipped.clear()

@@ -165,7 +165,7 @@ class Evb1000Bus:
             raise self._lost(getattr(error, "strerror", None) or str(error)) from error
 
     def _error(self, what: str, valid: str = _REMEDY) -> LinkError:
-        return LinkError(what, where=str(self._address), valid=valid)
+        return LinkError(what, where=self._address, valid=valid)
 
     def _lost(self, why: str) -> LinkError:
-        return LinkError(f"was lost: {why}", where=str(self._address), valid="plug the board in")
+        return LinkError(f"was lost: {why}", where=self._address, valid="plug the board in")

@@ -68,7 +68,7 @@ class UdpAddress(port.PortAddress):
             receiver.bind((self.host, self.number))
         except OSError as error:
             receiver.close()
-            raise LinkError(f"cannot be opened: {error.strerror or error}", where=str(self)) from error
+            raise LinkError(f"cannot be opened: {error.strerror or error}", where=self) from error
         return receiver
 
 

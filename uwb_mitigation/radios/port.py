@@ -470,7 +470,7 @@ class PortAddress:
         try:
             path = self.find() or ""
             if not path:
-                raise LinkError("is not there", where=str(self), valid="plug the board in")
+                raise LinkError("is not there", where=self, valid="plug the board in")
             port = serial.Serial(None, baud, timeout=0, exclusive=True)
             port.dtr = dtr
             port.port = path
@@ -478,7 +478,7 @@ class PortAddress:
         except (OSError, TypeError, ValueError) as error:
             # SerialException is an OSError; a ValueError is a baud rate that the port refuses; pyserial raises a
             # TypeError if a USB device is unplugged while it lists the ports.
-            raise LinkError(f"cannot be opened: {_open_error(path, error)}", where=str(self)) from error
+            raise LinkError(f"cannot be opened: {_open_error(path, error)}", where=self) from error
         os.set_blocking(port.fileno(), False)
         return port
 

@@ -48,7 +48,7 @@ def read_csv(
     file = TableFile(TableFormat(format="csv"), path, converter.columns, ids)
     chunks = list(islice(file.chunks(), 2))
     if len(chunks) != 1 or not 0 < chunks[0].count <= MAX_ROWS:
-        raise RecordingError("no rows, or too many", where=str(path), valid=f"1 to {MAX_ROWS} rows")
+        raise RecordingError("no rows, or too many", where=path, valid=f"1 to {MAX_ROWS} rows")
     columns = converter.convert(chunks[0])
     for name, (low, high) in [*((name, (0, UNKNOWN_ID - 1)) for name in ids), *numbers.items()]:
         bad = ~((columns[name] >= low) & (columns[name] <= high))

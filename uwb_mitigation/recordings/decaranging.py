@@ -137,9 +137,7 @@ class DecaRangingLog(Source):
         placed = self._placement
         text, fault = _read(self.path)
         if not (_TOKEN.search(text) or fault):
-            raise RecordingError(
-                "not a DecaRanging log", where=str(self.path), valid="lines such as 'RX DATA:'"
-            )
+            raise RecordingError("not a DecaRanging log", where=self.path, valid="lines such as 'RX DATA:'")
         for sequence, measured in enumerate(self._measurements(text, not_before_ns), first_sequence):
             tag, anchor = (placed.tag, placed.anchor) if placed else (measured.tag_id, measured.anchor_id)
             numbered = replace(measured, sequence=sequence & 0xFFFFFFFF, tag_id=tag, anchor_id=anchor)
@@ -250,12 +248,12 @@ def _read(path: Path) -> tuple[bytes, str]:
             while block := stream.read(1 << 16):
                 blocks.append(block)
                 if len(blocks) << 16 > MAX_BYTES:
-                    raise RecordingError(f"more than {MAX_BYTES} bytes", where=str(path))
+                    raise RecordingError(f"more than {MAX_BYTES} bytes", where=path)
     except OSError as error:
-        raise RecordingError(f"cannot be read: {error}", where=str(path)) from error
+        raise RecordingError(f"cannot be read: {error}", where=path) from error
     fault = str(source.damage or "")
     if fault and not blocks:
-        raise RecordingError(f"cannot be read: {fault}", where=str(path))
+        raise RecordingError(f"cannot be read: {fault}", where=path)
     text = b"".join(blocks).replace(b"\r\n", b"\n")
     complete = text[: text.rfind(b"\n") + 1]
     return complete, fault or ("ends in the middle of a line" if len(complete) < len(text) else "")
@@ -301,7 +299,7 @@ class DecaRangingFolder(Source):
             {log.name.removesuffix(".xz"): log for log in folder.glob(f"*.log{end}")} for end in ("", ".xz")
         )
         if not plain | compressed:
-            raise RecordingError("no logs", where=str(path), valid="*.log or *.log.xz, or logs/")
+            raise RecordingError("no logs", where=path, valid="*.log or *.log.xz, or logs/")
         survey = find_survey(folder)
         if survey is not None:
             self.anchors = survey[1]
@@ -343,7 +341,7 @@ def open_decaranging(
     if path.is_dir():
         return DecaRangingFolder(path, cir)
     if not path.is_file():
-        raise RecordingError("no such file or folder", where=str(path), valid="a log, or a folder of logs")
+        raise RecordingError("no such file or folder", where=path, valid="a log, or a folder of logs")
     return _make_log(path, find_survey(path.parent), cir)
 
 

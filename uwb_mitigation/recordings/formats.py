@@ -58,7 +58,7 @@ def open_recording(path: Path | str, *, mapping: str = "", cir: Literal["final",
         reader = _reader("decaranging")
         log: Source = reader.open_decaranging(path, cir=reader.CirFrame(cir))
         return log
-    raise RecordingError("unknown kind of recording", where=str(path), valid=ACCEPTED)
+    raise RecordingError("unknown kind of recording", where=path, valid=ACCEPTED)
 
 
 def open_mapped(path: Path, mapping: str) -> MappedRecording:
@@ -73,7 +73,7 @@ def open_mapped(path: Path, mapping: str) -> MappedRecording:
         recording: MappedRecording = _reader("mapping.mapped").MappedRecording(table, path)
     except (ValueError, TypeError, LookupError, ArithmeticError, AttributeError) as error:
         what = f"the values cannot be converted: {type(error).__name__}: {error!s:.200}"
-        raise RecordingError(what, where=str(path), valid=f"values as mapping {mapping} describes") from error
+        raise RecordingError(what, where=path, valid=f"values as mapping {mapping} describes") from error
     return recording
 
 
@@ -100,6 +100,6 @@ def _looks_like_log(path: Path) -> bool:
 def _head(path: Path) -> bytes:
     if not path.is_file():
         path.stat()
-        raise RecordingError("neither a file nor a folder", where=str(path), valid=ACCEPTED)
+        raise RecordingError("neither a file nor a folder", where=path, valid=ACCEPTED)
     with path.open("rb") as stream:
         return stream.read(4096)

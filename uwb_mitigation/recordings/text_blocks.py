@@ -77,7 +77,7 @@ def text_blocks(path: Path, on_warning: OnWarning | None, quote: str = "") -> It
             total, unread = total + len(data), unread + data
             if total > limit:
                 what = f"the file expands to more than {MAX_EXPANSION} times its size"
-                raise RecordingError(what, where=str(path), valid="no decompression bomb")
+                raise RecordingError(what, where=path, valid="no decompression bomb")
             end = unread.rfind("\n") + 1
             if quote and unread.count(quote, 0, end) % 2:
                 end = unread.rfind("\n", 0, unread.rfind(quote, 0, end)) + 1
@@ -86,15 +86,15 @@ def text_blocks(path: Path, on_warning: OnWarning | None, quote: str = "") -> It
                 unread, yielded = unread[end:], True
     if len(unread) >= MAX_ROW_CHARS or ("\n" in unread and not source.damage):
         what = f"a closing quote or a line break is missing after {unread[:60]!r}"
-        raise RecordingError(what, where=str(path))
+        raise RecordingError(what, where=path)
     if source.damage:
-        raise DamagedRecordingError(f"truncated or corrupt: {source.damage}", where=str(path))
+        raise DamagedRecordingError(f"truncated or corrupt: {source.damage}", where=path)
     if unread and on_warning and yielded:
         on_warning(f"{path.name}: the file does not end with a line break; the last row is not used")
     elif unread:
         yield unread
     elif not yielded:
-        raise RecordingError("the file is empty", where=str(path))
+        raise RecordingError("the file is empty", where=path)
 
 
 def _encoding(head: bytes) -> str:

@@ -210,5 +210,5 @@ def save_anchors(path: Path, anchors: AnchorMap, comment: str = "", *, force: bo
         ParameterError: it exists and `force` is not given, or it cannot be written.
     """
     if path.exists() and not force:
-        raise ParameterError("exists already", where=str(path), valid="--force replaces it")
+        raise ParameterError("exists already", where=path, valid="--force replaces it")
     write_atomically(path, dump_anchors(anchors, comment), ParameterError)

@@ -33,11 +33,11 @@ def plan(sources: Sequence[Path], output: Path) -> dict[Path, Path]:
     for source, bags in folders.items():
         if not bags:
             valid = "MCAP bags; `uwb-mitigation data import` converts logs and tables"
-            raise RecordingError("the folder contains no MCAP bag", where=str(source), valid=valid)
+            raise RecordingError("the folder contains no MCAP bag", where=source, valid=valid)
     if output.suffix == ".mcap" or (output.exists() and not output.is_dir()):
         raise ParameterError(
             "one output file for several bags",
-            where=str(output),
+            where=output,
             valid="a folder, which is created if it does not exist",
         )
     planned: dict[Path, Path] = {}
@@ -53,7 +53,7 @@ def plan(sources: Sequence[Path], output: Path) -> dict[Path, Path]:
             if place in planned:
                 raise ParameterError(
                     f"{planned[place]} and {bag} have the same name",
-                    where=str(place),
+                    where=place,
                     valid="different names, or separate runs",
                 )
             planned[place] = bag
@@ -63,7 +63,7 @@ def plan(sources: Sequence[Path], output: Path) -> dict[Path, Path]:
 def _is_one_bag(path: Path) -> bool:
     """Return whether a path is a file, or a folder with a `metadata.yaml` of one bag."""
     if not path.exists():
-        raise RecordingError("no such file or folder", where=str(path))
+        raise RecordingError("no such file or folder", where=path)
     if not path.is_dir():
         return True
     described = listed_files(path)
@@ -118,7 +118,7 @@ def run_locally(jobs: Sequence[Job], workers: int) -> Iterator[Outcome]:
         # A process that was stopped may have written its output already.
         again = replace(job, force=job.force or is_new[job])
         reason = "the process crashed, perhaps because memory ran out"
-        crashed = Outcome(job, error=RecordingError(reason, where=str(job.source)))
+        crashed = Outcome(job, error=RecordingError(reason, where=job.source))
         with _processes(1) as executor:
             for _, outcome in _run(executor, _in_worker, [again]):
                 yield replace(outcome or crashed, job=job)
@@ -175,7 +175,7 @@ def _run(
                 yield job, None
             except Exception as error:  # Errors of the cluster or of pickling have no common type.
                 reason = f"cannot be processed: {type(error).__name__}: {error}"
-                yield job, Outcome(job, error=RecordingError(reason, where=str(job.source)))
+                yield job, Outcome(job, error=RecordingError(reason, where=job.source))
     finally:
         for future in futures:
             future.cancel()
@@ -189,6 +189,6 @@ def _in_worker(job: Job) -> Outcome:
     except KeyboardInterrupt:
         # The interrupt may come between the creation of the file and the block that removes it.
         partial_file(job.output).unlink(missing_ok=True)
-        return Outcome(job, error=RecordingError("interrupted", where=str(job.source)))
+        return Outcome(job, error=RecordingError("interrupted", where=job.source))
     finally:
         signal.signal(signal.SIGINT, signal.SIG_IGN)

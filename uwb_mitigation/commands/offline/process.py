@@ -98,9 +98,9 @@ def try_process(job: Job, report: Report | None = None) -> Outcome:
             raise
         return Outcome(job, error=absent)
     except MemoryError:
-        return Outcome(job, error=RecordingError("not enough memory", where=str(job.source)))
+        return Outcome(job, error=RecordingError("not enough memory", where=job.source))
     except OSError as error:
-        problem = RecordingError(f"cannot be processed: {error.strerror}", where=str(job.source))
+        problem = RecordingError(f"cannot be processed: {error.strerror}", where=job.source)
         return Outcome(job, error=problem)
 
 

@@ -56,7 +56,7 @@ def read_config(
         RecordingError: the bag cannot be read, or a topic is missing.
     """
     if not bag.exists():
-        raise RecordingError("no such bag", where=str(bag), valid="an MCAP bag")
+        raise RecordingError("no such bag", where=bag, valid="an MCAP bag")
     topic = settings.height_topic
     heights = None if topic is None else read_heights(bag, topic, settings.height_sd_m)
     return settings.config(anchors, heights, _read_robot(bag, settings, warn))

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import functools
 import inspect
+import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import typer
+from typer.core import TyperCommand
 
 from uwb_mitigation.errors import ParameterError
 
@@ -19,20 +21,41 @@ ScalingName = Literal["preamble", "max"]
 """Values of `Scaling`, which takes long to import."""
 
 
-def option(text: str, *names: str, **details: Any) -> Any:
-    """Return an option with its help text; `details` are those of `typer.Option`."""
+class Command(TyperCommand):
+    """A command whose docstring has the texts of its options in the section `Options`, {name of the parameter: text}.
+
+    An option that is False by default has no counterpart `--no-...`.
+    """
+
+    def __init__(self, *arguments: Any, help: str | None = None, **details: Any) -> None:
+        about, _, section = (help or "").partition("\n\nOptions:\n")
+        super().__init__(*arguments, help=about, **details)
+        entries = re.findall(r"^    (\w+): (.+(?:\n {8}.+)*)", section, re.MULTILINE)
+        texts = {name: " ".join(text.split()) for name, text in entries}
+        parameters: dict[str, Any] = {str(parameter.name): parameter for parameter in self.params}
+        for name, text in texts.items():
+            parameters[name].help = text
+        for parameter in parameters.values():
+            if parameter.default is False:
+                parameter.secondary_opts.clear()
+
+
+def option(text: str | None = None, *names: str, **details: Any) -> Any:
+    """Return an option with its help text (None: that of the docstring); `details` are those of `typer.Option`."""
     return typer.Option(*names, help=text, **details)
 
 
-def argument(metavar: str, text: str) -> Any:
+def argument(metavar: str, text: str | None = None) -> Any:
     """Return an argument without a name, which stands for itself in the help."""
     return typer.Argument(metavar=metavar, help=text)
 
 
-def output_option(metavar: str, text: str) -> Any:
+def output_option(metavar: str) -> Any:
     """Return the option `-o` for what a command writes."""
-    return option(text, "-o", "--output", metavar=metavar)
+    return typer.Option("-o", "--output", metavar=metavar)
 
+
+FileOption = Annotated[Path | None, option(metavar="FILE")]
 
 OffsetsOption = Annotated[
     str | None,
@@ -67,7 +90,7 @@ def check_replaceable(files: Iterable[Path], force: bool) -> None:
     """Raise a ParameterError if one of the files exists, unless `force` is set."""
     for file in files:
         if file.exists() and not force:
-            raise ParameterError("exists already", where=str(file), valid="--force replaces it")
+            raise ParameterError("exists already", where=file, valid="--force replaces it")
 
 
 def check_output(output: Path, force: bool = True, suffix: str = ".onnx") -> None:
@@ -78,7 +101,7 @@ def check_output(output: Path, force: bool = True, suffix: str = ".onnx") -> Non
     """
     if (suffix and output.suffix != suffix) or output.is_dir() or not output.resolve().parent.is_dir():
         valid = f"a file {suffix} in an existing folder" if suffix else "a file in an existing folder"
-        raise ParameterError("cannot be written", where=str(output), valid=valid)
+        raise ParameterError("cannot be written", where=output, valid=valid)
     check_replaceable([output], force)
 
 

@@ -45,7 +45,7 @@ def export_bundle(bundle: Bundle, folder: Path) -> Path:
     if not bundle.card.quantised:
         raise ModelError(
             "the firmware only runs int8 networks",
-            where=str(bundle.path),
+            where=bundle.path,
             valid="run `uwb-mitigation quantise`",
         )
     weights = graph.int8_weights(bundle.model, bundle.card.architecture)

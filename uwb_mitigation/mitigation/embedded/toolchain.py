@@ -96,7 +96,7 @@ def compile_image(
     if not boards.is_dir():
         raise MissingDependencyError(
             "the boards of the firmware are not installed",
-            where=str(boards),
+            where=boards,
             valid="in a checkout: python3 -m uwb_mitigation.commands.cli board build-image",
         )
     common = boards / "cortex_m4"

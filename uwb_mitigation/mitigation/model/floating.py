@@ -51,7 +51,7 @@ def float_network(source: Bundle) -> FloatWeights:
         ModelError: it is not a REMNet.
     """
     if not isinstance(source.card.architecture, Remnet):
-        raise ModelError("no REMNet to start from", where=str(source.path), valid="a bundle of `train`")
+        raise ModelError("no REMNet to start from", where=source.path, valid="a bundle of `train`")
     if not source.card.quantised:
         return graph.float_weights(source.model, source.card.architecture)
     integers = graph.int8_weights(source.model, source.card.architecture)

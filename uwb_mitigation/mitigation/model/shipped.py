@@ -75,7 +75,7 @@ def model_path(named: str | Path | None) -> Path:
     if not path.exists():
         raise ModelError(
             "neither a file nor a shipped model",
-            where=str(named),
+            where=named,
             valid=f"shipped models: {', '.join(SHIPPED)}",
             suggestion=did_you_mean(path.stem, SHIPPED),
         )
@@ -91,7 +91,7 @@ def shipped_model_path(name: str) -> Path:
     path = Path(str(files("uwb_mitigation"))) / "models" / f"{name}.onnx"
     if not path.is_file():
         valid = "install the package again, or give the path of a model"
-        raise ModelError(f"the shipped model {name} is not installed", where=str(path.parent), valid=valid)
+        raise ModelError(f"the shipped model {name} is not installed", where=path.parent, valid=valid)
     return path
 
 

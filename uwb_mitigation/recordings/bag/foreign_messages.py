@@ -45,11 +45,11 @@ def _check_topics(path: Path, topics: Collection[str], types: dict[str, str]) ->
     if missing := [topic for topic in topics or [""] if topic not in types]:
         listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(types.items())[:40])
         what = f"no topic {missing[0]}" if missing[0] else "the mapping has no topics"
-        raise RecordingError(what, where=str(path), valid=f"the bag has: {listed or 'none'}")
+        raise RecordingError(what, where=path, valid=f"the bag has: {listed or 'none'}")
 
 
 def _damage(path: Path, error: Exception) -> DamagedRecordingError:
-    return DamagedRecordingError(f"truncated or corrupt: {error!s:.200}", where=str(path))
+    return DamagedRecordingError(f"truncated or corrupt: {error!s:.200}", where=path)
 
 
 class BagTypes:
@@ -105,7 +105,7 @@ def _ros1_messages(path: Path, topics: Collection[str]) -> Iterator[_Message]:
     damage: Exception | None = None
     with path.open("rb") as file:
         if not file.readline(32).startswith(b"#ROSBAG V2.0"):
-            raise RecordingError("not a ROS 1 bag of version 2.0", where=str(path))
+            raise RecordingError("not a ROS 1 bag of version 2.0", where=path)
         streams: list[BinaryIO] = [file]
         try:
             while streams:

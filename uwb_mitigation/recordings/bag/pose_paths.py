@@ -202,7 +202,7 @@ def check_topic(path: Path, recorded: dict[str, str], topic: str, types: tuple[s
     what = f"topic {topic} has the type {recorded[topic]}" if topic in recorded else f"no topic {topic}"
     valid = ", ".join(usable) or f"a topic of type {', '.join(types)}; the bag has none"
     suggestion = did_you_mean(topic, [name for name, kind in recorded.items() if kind in types])
-    raise RecordingError(what, where=str(path), valid=valid, suggestion=suggestion)
+    raise RecordingError(what, where=path, valid=valid, suggestion=suggestion)
 
 
 def read_topic(path: Path, topic: str, types: tuple[str, ...]) -> Iterator[Any]:

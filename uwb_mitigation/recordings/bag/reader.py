@@ -217,9 +217,7 @@ class BagReader:
         if topic not in self.topics:
             listed = ", ".join(f"{name} ({kind})" for name, kind in sorted(self.topics.items()))
             valid, suggestion = f"the bag contains: {listed or 'no topic'}", did_you_mean(topic, self.topics)
-            raise RecordingError(
-                f"no topic {topic}", where=str(self._path), valid=valid, suggestion=suggestion
-            )
+            raise RecordingError(f"no topic {topic}", where=self._path, valid=valid, suggestion=suggestion)
 
     def messages(self, topics: Collection[str] | None = None, start_ns: int = -1) -> Iterator[RawMessage]:
         """Yield the messages of `topics` (None: all) whose log time is not before `start_ns`.
@@ -391,11 +389,11 @@ def _index(path: Path) -> _FileIndex:
     with os_errors(RecordingError, "cannot be read", path), _BoundedFile(path) as file:
         magic = file.read(min(file.size, MAGIC_SIZE))
         if not magic:
-            raise RecordingError("the file is empty", where=str(path), valid="an MCAP file")
+            raise RecordingError("the file is empty", where=path, valid="an MCAP file")
         if magic != MCAP0_MAGIC:
             raise RecordingError(
                 f"not an MCAP file: it starts with {magic.hex(' ')}",
-                where=str(path),
+                where=path,
                 valid="uwb-mitigation data import converts other formats to MCAP",
             )
         try:

@@ -104,14 +104,14 @@ def listed_files(folder: Path) -> list[str] | None:
         names = [PurePosixPath(entry).name for entry in paths]
     except (yaml.YAMLError, RecursionError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise RecordingError(
-            "not a rosbag2 metadata file", where=str(path), valid="remove it to read every *.mcap next to it"
+            "not a rosbag2 metadata file", where=path, valid="remove it to read every *.mcap next to it"
         ) from error
     if storage != "mcap":
         raise _unsupported_storage(folder, str(storage))
     if str(compression).lower() == "file":
         raise RecordingError(
             "the files of the bag are compressed in file mode",
-            where=str(path),
+            where=path,
             valid=_conversion_hint(folder),
         )
     return names
@@ -127,9 +127,9 @@ def bag_files(path: Path) -> list[Path]:
         if path.suffix == ".db3":
             raise _unsupported_storage(path, "sqlite3")
         if not path.exists():
-            raise RecordingError("no such file or folder", where=str(path))
+            raise RecordingError("no such file or folder", where=path)
         if not path.is_file():
-            raise RecordingError("not a regular file", where=str(path))
+            raise RecordingError("not a regular file", where=path)
         return [path]
     names = listed_files(path)
     if names is None:
@@ -140,10 +140,10 @@ def bag_files(path: Path) -> list[Path]:
     # Ignore the directory part of a listed name: the file must be in this folder.
     files = [path / name for name in names if name]
     if not files:
-        raise RecordingError("the folder contains no MCAP file", where=str(path))
+        raise RecordingError("the folder contains no MCAP file", where=path)
     for file in files:
         if not file.is_file():
-            raise RecordingError(f"{METADATA_NAME} lists a missing file", where=str(file))
+            raise RecordingError(f"{METADATA_NAME} lists a missing file", where=file)
     return files
 
 
@@ -154,7 +154,7 @@ def _natural_sort_key(name: str) -> list[tuple[int, str]]:
 
 def _unsupported_storage(path: Path, storage: str) -> RecordingError:
     return RecordingError(
-        f"the bag is stored as {storage[:32]}, not as MCAP", where=str(path), valid=_conversion_hint(path)
+        f"the bag is stored as {storage[:32]}, not as MCAP", where=path, valid=_conversion_hint(path)
     )
 
 

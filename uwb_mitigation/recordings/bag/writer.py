@@ -53,13 +53,13 @@ def check_bag_output(path: Path, *, force: bool = False) -> None:
     """
     is_file, folder = path.suffix == ".mcap", path.absolute().parent
     if is_file and not folder.is_dir():
-        raise ParameterError("the folder of the output does not exist", where=str(path), valid=str(folder))
+        raise ParameterError("the folder of the output does not exist", where=path, valid=str(folder))
     if not is_file and path.exists() and not path.is_dir():
-        raise ParameterError("a file instead of a bag folder", where=str(path))
+        raise ParameterError("a file instead of a bag folder", where=path)
     # Without `force`, a broken link is not replaced either.
     occupied = os.path.lexists(_bag_file(path)) or (not is_file and path.is_dir() and any(path.iterdir()))
     if occupied and not force:
-        raise ParameterError("exists already", where=str(path), valid="--force replaces it")
+        raise ParameterError("exists already", where=path, valid="--force replaces it")
 
 
 class BagWriter:
@@ -247,4 +247,4 @@ class BagWriter:
 
     def _write_error(self, error: OSError) -> RecordingError:
         self._discard()
-        return RecordingError(f"cannot be written: {error.strerror}", where=str(self.file))
+        return RecordingError(f"cannot be written: {error.strerror}", where=self.file)

@@ -204,7 +204,7 @@ class Converter:
                     factor = SCALES[unit] / SCALES[value.unit or "m"] if value else 1.0
                     columns[name] = columns[name] * np.where(columns["anchor"] == anchor, factor, 1.0)
         except UNREADABLE as error:
-            raise RecordingError(f"{name} cannot be read: {error!s:.200}", where=str(chunk.path)) from error
+            raise RecordingError(f"{name} cannot be read: {error!s:.200}", where=chunk.path) from error
         if "cir_power" in columns:
             _add_levels(columns)
         return columns
@@ -300,11 +300,11 @@ def _raw(value: FieldRule, chunk: Chunk) -> NDArray[Any] | None:
     if missing := [name for name in names if name not in chunk.columns]:
         if value.optional:
             return None
-        raise RecordingError(f"no column {missing[0]}", where=str(chunk.path))
+        raise RecordingError(f"no column {missing[0]}", where=chunk.path)
     arrays = [np.asarray(chunk.columns[name]) for name in names]
     for name, array in zip(names, arrays, strict=True):
         if array.ndim > 1 or (array.dtype == object and len(array) and np.ndim(array[0])):
-            raise RecordingError(f"column {name} contains lists", where=str(chunk.path), valid=f"{name}[]")
+            raise RecordingError(f"column {name} contains lists", where=chunk.path, valid=f"{name}[]")
     if value.or_index:
         index = chunk.columns[LIST_INDEX]
         return np.array(
@@ -326,7 +326,7 @@ def read_stamps(value: FieldRule | None, chunk: Chunk) -> NDArray[np.int64]:
     if value is None or (raw := _raw(value, chunk)) is None:
         if LOG_TIME in chunk.columns:
             return np.asarray(chunk.columns[LOG_TIME], np.int64)
-        raise RecordingError("no stamp", where=str(chunk.path), valid="fields.stamp: a column, or rate_hz")
+        raise RecordingError("no stamp", where=chunk.path, valid="fields.stamp: a column, or rate_hz")
     if value.unit == "iso8601" or "%" in value.unit:
         stamps, is_known = _dates(raw, value.unit, chunk)
         possible = is_known & (np.abs(stamps / 1e9) < MAX_STAMP_S)
@@ -353,7 +353,7 @@ def read_stamps(value: FieldRule | None, chunk: Chunk) -> NDArray[np.int64]:
         dates_s = [(unit, abs(float(first) * TIME[unit] / 1e9)) for unit in ("s", "ms", "us", "ns")]
         unit = next((f"unit: {unit}" for unit, date_s in dates_s if 9e8 < date_s < MAX_STAMP_S), "")
         what, valid = f"stamp = {first} is outside of the years 1824 to 2115", unit or "seconds since 1970"
-        raise RecordingError(what, where=str(chunk.path), valid=valid)
+        raise RecordingError(what, where=chunk.path, valid=valid)
     possible &= np.abs(stamps / 1e9 + value.offset) < MAX_STAMP_S
     offset = round(min(max(value.offset, -MAX_STAMP_S), MAX_STAMP_S) * 1e9)
     return np.where(possible, stamps + offset, UNKNOWN_STAMP)
@@ -384,7 +384,7 @@ def _read_ids(value: FieldRule, chunk: Chunk, name: str, names: dict[str, int]) 
     """Return ids, uint64 (n,); `UNKNOWN_ID`: unknown; `names` numbers the texts of `names: true`."""
     raw = _raw(value, chunk)
     if raw is None:
-        raise RecordingError(f"no column {value.source} for the {name}", where=str(chunk.path))
+        raise RecordingError(f"no column {value.source} for the {name}", where=chunk.path)
     is_converted = value.is_text or value.hex or value.names or value.offset or value.scale != 1
     if raw.dtype.kind in "iu" and not is_converted and raw.min(initial=0) >= 0:
         return np.asarray(raw, np.uint64)

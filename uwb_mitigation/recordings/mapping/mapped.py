@@ -173,7 +173,7 @@ class MappedRecording(Source):
                 for chunk in TableFile(table, path, *arguments).chunks(before):
                     before += chunk.count
                     if before > MAX_RANGES:
-                        raise RecordingError(f"more than {MAX_RANGES} rows", where=str(path))
+                        raise RecordingError(f"more than {MAX_RANGES} rows", where=path)
                     rules = conversion.filter_rows(table.drop, chunk, what)
                     chunk = chunk.take(conversion.count_kept(rules, chunk.count, self.dropped))
                     cirs = self._cirs.add(cir, chunk) if cir else np.broadcast_to(-1, chunk.count)
@@ -184,7 +184,7 @@ class MappedRecording(Source):
                 self.warnings.append(f"{error}: only the rows before are used")
         self.dropped.update({f"{what}{reason}": count for reason, count in dropped.items()})
         if not tables:
-            raise self._damage or RecordingError("no rows", where=str(paths[0]))
+            raise self._damage or RecordingError("no rows", where=paths[0])
         rows = conversion.concat(tables)
         numbers = {name: rows.pop(name) for name in medians}
         outliers = {
@@ -333,7 +333,7 @@ class MappedRecording(Source):
                 is_target = mask & (values["tag"] == tag) & (values["anchor"] == anchor)
                 if not source.stamp and np.ptp(rows["range"][is_pair]) > 0:
                     what = f"tag {format_id(tag)} and anchor {format_id(anchor)} have several true ranges"
-                    raise RecordingError(what, where=str(paths[0]), valid="truth.range.stamp: their times")
+                    raise RecordingError(what, where=paths[0], valid="truth.range.stamp: their times")
                 stamps = values["stamp"][is_target] if source.stamp else np.zeros(is_target.sum(), np.int64)
                 path = TruePath(rows["stamp"][is_pair], rows["range"][is_pair][:, np.newaxis])
                 true[is_target] = path.position_at(stamps)[:, 0]

@@ -517,4 +517,4 @@ def load_mapping(name: str) -> Mapping:
     except ValidationError as error:
         problem = error.errors()[0]
         texts = [".".join(map(str, problem["loc"])), problem["msg"].removeprefix("Value error, ")]
-        raise ParameterError(": ".join(filter(None, texts)), where=str(path)) from error
+        raise ParameterError(": ".join(filter(None, texts)), where=path) from error

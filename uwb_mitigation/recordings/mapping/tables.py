@@ -69,7 +69,7 @@ def find_files(table: TableFormat, root: Path, ranges: Path | None = None) -> li
             pattern = next((glob for rule, glob in pattern.items() if re.search(rule, absolute)), "")
         paths = sorted(path for path in root.glob(pattern) if path.is_file()) if pattern else []
     except (ValueError, NotImplementedError, OSError, re.error) as error:
-        raise RecordingError(f"files = {pattern!r}: {error}", where=str(root), valid="a glob") from error
+        raise RecordingError(f"files = {pattern!r}: {error}", where=root, valid="a glob") from error
     if pattern == "*":
         # The folder may contain the mapping, logs and descriptions.
         kinds = {"csv", "matlab", "hdf5", "messages", table.format} - {"", "yaml"}
@@ -80,7 +80,7 @@ def find_files(table: TableFormat, root: Path, ranges: Path | None = None) -> li
         valid = "the folder that contains the files of the mapping"
         if ranges:
             valid = f"relative to the folder of the ranges, {root}"
-        raise RecordingError(what, where=str(root), valid=valid)
+        raise RecordingError(what, where=root, valid=valid)
     return paths
 
 
@@ -122,7 +122,7 @@ class TableFile:
         is_log = kind != "messages" and (table.pattern or table.text)
         kind = "lines" if is_log else kind.replace("lines", "")
         if (groups := re.search(table.file_name, self.file)) is None:
-            raise RecordingError(f"{self.file!r} does not match {table.file_name!r}", where=str(path))
+            raise RecordingError(f"{self.file!r} does not match {table.file_name!r}", where=path)
         constants = {FILE: self.file, **groups.groupdict()}
         needed = {**self.columns, **{rule.column: False for rule in table.drop}}
         self.columns = {name: optional for name, optional in needed.items() if name not in constants}
@@ -135,7 +135,7 @@ class TableFile:
                 rows = self._arrays(is_matlab=kind == "matlab")
             else:
                 valid = "csv, hdf5, json, matlab, messages, yaml; lines with `pattern` or `text`; save others as CSV"
-                raise RecordingError(f"unknown format {path.suffix}", where=str(path), valid=valid)
+                raise RecordingError(f"unknown format {path.suffix}", where=path, valid=valid)
             last = 0
             for values, numbers in rows:
                 last = int(numbers.max(initial=last - 1)) + 1
@@ -150,7 +150,7 @@ class TableFile:
             raise
         except Exception as error:
             # For damaged files the libraries raise many other types, such as BadZipFile or ZeroDivisionError.
-            raise RecordingError(f"cannot be read: {error!s:.200}", where=str(path)) from error
+            raise RecordingError(f"cannot be read: {error!s:.200}", where=path) from error
 
     def _up_to_damage(self, items: Iterable[Any]) -> Iterator[Any]:
         """Yield items; `chunks` raises the error after the rows before."""
@@ -196,7 +196,7 @@ class TableFile:
             columns = {n: a if getattr(a, "ndim", 0) else np.atleast_1d(a) for n, a in columns.items()}
             lengths = {name: len(array) for name, array in columns.items()}
             if len(set(lengths.values())) > 1:
-                raise RecordingError("columns of different length", where=str(self.path), valid=str(lengths))
+                raise RecordingError("columns of different length", where=self.path, valid=str(lengths))
             width = max([int(np.prod(array.shape[1:])) for array in columns.values()], default=1)
             rows = max(1, min(CHUNK_ROWS, CHUNK_VALUES // max(width, 1)))
             for first in range(0, count := max(lengths.values(), default=0), rows):
@@ -238,7 +238,7 @@ class TableFile:
     def _group(self, content: Any) -> Any:
         if (group := self.table.group) and group not in content:
             valid = ", ".join(map(str, content))
-            raise RecordingError(f"no variable {group}", where=str(self.path), valid=valid)
+            raise RecordingError(f"no variable {group}", where=self.path, valid=valid)
         return content[group] if group else content
 
     def _messages(self, kind: str) -> Rows:
@@ -332,7 +332,7 @@ class _CsvRows:
         originals = [name.strip('" ') for name in self._header.split(self._mark)]
         if equal := [name for name in self._chosen.values() if originals.count(name) > 1]:
             what, valid = f"several columns have the name {equal[0]}", f"columns: [{', '.join(names[:40])}]"
-            raise RecordingError(what, where=str(self._file.path), valid=f"{valid} and skip: 1")
+            raise RecordingError(what, where=self._file.path, valid=f"{valid} and skip: 1")
         if self._table.columns:
             # Pandas refuses columns that no row of a block has.
             self._header = self._mark.join("x" * len(names))

@@ -131,12 +131,12 @@ def _read_frame(path: Path) -> pd.DataFrame:
     try:
         frame = _FrameUnpickler(io.BytesIO(data)).load()
     except Exception as error:  # a damaged pickle raises any kind of error
-        raise RecordingError(f"not a pickled data frame: {error}", where=str(path)) from error
+        raise RecordingError(f"not a pickled data frame: {error}", where=path) from error
     columns = ("CIR", "Error", "Room", "Obstacles")
     if not isinstance(frame, pd.DataFrame) or not set(columns) <= set(frame.columns):
-        raise RecordingError("not DeepUWB's frame", where=str(path), valid=f"columns {', '.join(columns)}")
+        raise RecordingError("not DeepUWB's frame", where=path, valid=f"columns {', '.join(columns)}")
     if len(frame) == 0:
-        raise RecordingError("no rows", where=str(path))
+        raise RecordingError("no rows", where=path)
     return frame
 
 

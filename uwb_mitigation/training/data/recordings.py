@@ -59,7 +59,7 @@ def load_inputs(path: Path, preprocessing: Preprocessing, counted: Counted = ite
     with formats.open_recording(path) as source:
         dataset = datasets.build_dataset(counted(map(_with_configuration, source)), preprocessing)
     if not dataset.has_cirs:
-        raise DatasetError("the recording has no CIRs", where=str(path))
+        raise DatasetError("the recording has no CIRs", where=path)
     return dataset
 
 

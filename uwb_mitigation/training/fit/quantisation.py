@@ -81,10 +81,10 @@ def quantise_network(
 def check(source: Bundle) -> None:
     """Check the arguments of `quantise_bundle` before data is read; raises the same errors."""
     if source.card.quantised:
-        raise ModelError("already quantised", where=str(source.path), valid="the float bundle it was made of")
+        raise ModelError("already quantised", where=source.path, valid="the float bundle it was made of")
     if not source.card.needs_cir:
         raise ModelError(
-            "there is no network to quantise", where=str(source.path), valid="the bundle without quantisation"
+            "there is no network to quantise", where=source.path, valid="the bundle without quantisation"
         )
 
 
