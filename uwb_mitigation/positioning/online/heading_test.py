@@ -52,6 +52,9 @@ STEP_M, EVERY_M, SHORTEST_M, FEWEST = 0.2, 1.5, 3.0, 8
 ERROR_M, UNSEEN_M = 0.12, 0.05
 """Standard deviations of positions that are added to the residuals of fits: to compare them, and for the variance of the heading."""
 
+TURNING_SHARE = 0.6
+"""Share of the variance of positions that changes along their path and turns it. Chosen on simulated drives with seeds 20 to 35."""
+
 SCALE_LIMITS = 0.9, 1.1
 """Of distances in the odometry."""
 
@@ -222,11 +225,11 @@ class HeadingTest:
         evidence = self._evidence + np.clip(gain, -most, most)[1:]
         self._evidence = np.minimum(evidence, MOST_EVIDENCE).tolist()
         self._fitted_m, self._rotation = float(distance_m[-1]), float(np.angle(rotation[0]))
-        # Errors of ranges persist: averaging does not reduce the variance of the rotation. Those that change along the path turn
-        # it, and the residuals of the fit do not show them.
+        # Errors of ranges persist: averaging does not reduce the variance of the rotation, and residuals do not show those that turn
+        # the path.
         spread = float(np.mean(np.abs(position) ** 2))
         self._variance = float(square[0] + UNSEEN_M**2) / (2.0 * spread)
-        self._bias = float(np.mean(variance[fitted])) / spread
+        self._bias = TURNING_SHARE * float(np.mean(variance[fitted])) / spread
         # From the beginning of the fitted path until now.
         self._drift = sum(float(drift[-1] - drift[fitted.start]) ** 2 for drift in drifts)
         self._judge()
