@@ -204,8 +204,7 @@ class RobotEstimator:
         # A wrong heading separates the solutions by more than their covariances.
         factor = max(self._separation, self._latest_separation, EQUAL_SEPARATION) / EQUAL_SEPARATION
         variance = self._test.variance(yaw, yaw_variance, heading_filter.point, factor)
-        if self.odometry.twist is not None:
-            variance += (STAMP_SD * self.odometry.twist[2]) ** 2
+        variance += (STAMP_SD * (self.odometry.twist or (0.0, 0.0, 0.0))[2]) ** 2
         # Ranges show a turn that late odometry hides first as a separation that averages do not contain yet.
         self._is_confirmed = variance < math.inf and not (self._is_apart and self._test.may_be_late)
         heading: Heading | None = None
