@@ -46,9 +46,8 @@ APART = 10.0
 """Squared separation, without averaging, from which a heading is withheld while late stamps of the odometry are not excluded: so the ranges
 show a sharp turn 0.7 s after its beginning. Correct odometry reaches 7.9 (simulated ellipse in a hall, two minutes at rest)."""
 
-STAMP_SD = 0.15
-"""Standard deviation of the time between the stamps of odometry and ranges, s, in which the robot turns. `HeadingTest` excludes
-longer ones only."""
+STAMP_SD = 0.12
+"""Standard deviation of the time between the stamps of odometry and ranges, s; `HeadingTest` excludes longer ones only."""
 
 CONSTANT_SHARE = 0.4
 """Share of the covariance of ranges only that odometry does not reduce: errors of ranges that stay the same, or return with the place."""
