@@ -10,10 +10,11 @@ from drives import HALL, anchors_at, circuit, drive
 from uwb_mitigation.calibration.hypotheses import AnchorHypotheses
 from uwb_mitigation.calibration.motion_segments import find_segments
 from uwb_mitigation.calibration.pose_alignment import align_poses
+from uwb_mitigation.calibration.regression import SLOPE_SD, Regressors
 from uwb_mitigation.calibration.self_calibration import self_calibrate
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.geometry import Area, Height
-from uwb_mitigation.positioning.noise_model import SLOPE_SD, NoiseModel, Regressors
+from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.types.tracks import PosePath, Ranges
 
 LEVEL = Height(1.0)

@@ -18,10 +18,10 @@ from scipy.optimize import minimize
 from uwb_mitigation.calibration.first_positions import first_positions
 from uwb_mitigation.calibration.joint_fit import JointFit, Start, fit_joint, observations_of
 from uwb_mitigation.calibration.motion_segments import GAP_S, Segments
+from uwb_mitigation.calibration.regression import MAD_TO_SD, Regressors
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.geometry import unit_vectors
-from uwb_mitigation.positioning.noise_model import MAD_TO_SD, Regressors
 from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Ranges

@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.calibration.motion_segments import Segments
+from uwb_mitigation.calibration.regression import CORRECTED_SLOW_SD_M, Regressors, scatter_of
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.batch.least_squares import LeastSquares, Solution, gauss_newton
 from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.geometry import unit_vectors
-from uwb_mitigation.positioning.noise_model import CORRECTED_SLOW_SD_M, NoiseModel, Regressors, scatter_of
+from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.types.stamps import NS_PER_S
 
 KNOT_S = 0.15

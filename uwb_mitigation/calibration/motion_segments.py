@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.positioning.noise_model import MAD_TO_SD
+from uwb_mitigation.calibration.regression import MAD_TO_SD
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Ranges
 

@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.calibration.joint_fit import medians
+from uwb_mitigation.calibration.regression import Regressors, scatter_of
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.batch.least_squares import gauss_newton
 from uwb_mitigation.positioning.geometry import unit_vectors
-from uwb_mitigation.positioning.noise_model import NoiseModel, Regressors, scatter_of
+from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import PosePath, Ranges

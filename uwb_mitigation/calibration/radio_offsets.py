@@ -14,13 +14,13 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from uwb_mitigation.calibration.regression import MAD_TO_SD
 from uwb_mitigation.errors import DatasetError, ParameterError, format_id
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.choice import CirKind
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.mitigation.model.ood import FIRST_PATH_TAPS
 from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
-from uwb_mitigation.positioning.noise_model import MAD_TO_SD
 from uwb_mitigation.types.measurement import (
     LINE_OF_SIGHT_DB,
     CorrectedRange,

@@ -17,10 +17,11 @@ from uwb_mitigation.calibration.hypotheses import check_anchors, displacement_no
 from uwb_mitigation.calibration.joint_fit import SD_INFLATION, JointFit, Start, fit_segments
 from uwb_mitigation.calibration.motion_segments import Segments, find_segments
 from uwb_mitigation.calibration.observability import check_height, check_layout, check_motion, mirrored
+from uwb_mitigation.calibration.regression import Regressors
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.geometry import Area, Height, unit_vectors
-from uwb_mitigation.positioning.noise_model import NoiseModel, Regressors
+from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.tracks import Ranges
 

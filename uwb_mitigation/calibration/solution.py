@@ -10,13 +10,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from uwb_mitigation.calibration import regression
 from uwb_mitigation.calibration.hypotheses import AnchorHypotheses
 from uwb_mitigation.calibration.joint_fit import medians
 from uwb_mitigation.calibration.pose_alignment import PoseAlignment, align_poses
 from uwb_mitigation.calibration.self_calibration import SelfCalibration, self_calibrate
 from uwb_mitigation.calibration.site_data import SiteData
 from uwb_mitigation.errors import DatasetError, format_id
-from uwb_mitigation.positioning import noise_model
 from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.types.offsets import Offsets
 from uwb_mitigation.types.tracks import PosePath
@@ -379,7 +379,7 @@ def _aligned_offsets(site: SiteData, alignment: PoseAlignment) -> tuple[float, P
         for (tag, row), offset_m, sd_m in offsets
     }
     common = float(np.median([value for value, sd in pairs.values() if sd <= MAX_TRUTH_SD_M] or [0.0]))
-    scatter_m = noise_model.MAD_TO_SD * float(np.median([abs(value - common) for value, _ in pairs.values()]))
+    scatter_m = regression.MAD_TO_SD * float(np.median([abs(value - common) for value, _ in pairs.values()]))
     # With few ranges, the other pairs determine the offset of a pair better than its own ranges.
     typical_offset = common, math.hypot(MAX_TRUTH_SD_M, scatter_m)
     return common, {
@@ -394,7 +394,7 @@ def _level_height(position: NDArray[np.float64]) -> Height | None:
     return Height(float(np.median(position[:, 2])), 0.1)
 
 
-def regressors(site: SiteData, *, has_truth: bool) -> noise_model.Regressors:
+def regressors(site: SiteData, *, has_truth: bool) -> regression.Regressors:
     """Return the regressors in addition to offsets: the universal network with CIRs, otherwise with ground truth the powers.
 
     Without ground truth a line in the powers follows the track as much as the errors of the ranges.
@@ -405,16 +405,16 @@ def regressors(site: SiteData, *, has_truth: bool) -> noise_model.Regressors:
         edges = np.quantile(size[site.table["is_usable"]], np.linspace(0.0, 1.0, NETWORK_GROUPS + 1)[1:-1])
         # Ranges without a CIR are not corrected, so they have their own standard deviation.
         group = np.where(site.table["is_usable"], np.searchsorted(edges, size), NETWORK_GROUPS)
-        row, mean, sd = site.table["universal_m"][:, None], np.ones(1), np.array([noise_model.NETWORK_SD])
-        return noise_model.Regressors((NETWORK,), row, mean, sd, group, noise_model.CORRECTED_SLOW_SD_M)
+        row, mean, sd = site.table["universal_m"][:, None], np.ones(1), np.array([regression.NETWORK_SD])
+        return regression.Regressors((NETWORK,), row, mean, sd, group, regression.CORRECTED_SLOW_SD_M)
     power_dbm = site.table["rx_power_dbm"].astype(np.float64)
-    columns = [noise_model.Regressors.none(len(power_dbm))]
+    columns = [regression.Regressors.none(len(power_dbm))]
     for name, value in ((LEVEL, power_dbm), (POWER_GAP, power_dbm - site.table["first_path_power_dbm"])):
         is_known = np.isfinite(value)
         if has_truth and is_known.mean() >= 0.5 and np.ptp(value[is_known]) >= 1.0:
             centred = np.where(is_known, value - np.median(value[is_known]), 0.0)
-            columns.append(noise_model.Regressors.single(name, centred, 0.0, noise_model.SLOPE_SD))
-    return functools.reduce(noise_model.Regressors.concat, columns)
+            columns.append(regression.Regressors.single(name, centred, 0.0, regression.SLOPE_SD))
+    return functools.reduce(regression.Regressors.concat, columns)
 
 
 def _without_outliers(
@@ -424,6 +424,6 @@ def _without_outliers(
     if not is_known.any():
         return is_known, 0
     distance_m = np.abs(error_m - np.median(error_m[is_known]))
-    limit = max(OUTLIER_M, OUTLIER_SDS * noise_model.MAD_TO_SD * float(np.median(distance_m[is_known])))
+    limit = max(OUTLIER_M, OUTLIER_SDS * regression.MAD_TO_SD * float(np.median(distance_m[is_known])))
     is_used = is_known & (distance_m <= limit)
     return is_used, int(is_known.sum() - is_used.sum())

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from uwb_mitigation.calibration.hypotheses import LIMITS, AnchorHypotheses, find_swapped
 from uwb_mitigation.calibration.motion_segments import find_segments
 from uwb_mitigation.calibration.observability import MOVES_M
+from uwb_mitigation.calibration.regression import Regressors
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.batch.smoother import Smoothed, Smoother
 from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.geometry import extents
-from uwb_mitigation.positioning.noise_model import Regressors
 from uwb_mitigation.positioning.online.tag_estimator import TagEstimator
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.tracks import Ranges, Track
