@@ -128,10 +128,19 @@ def test_corrections_that_are_wrong_behind_thin_walls_hardly_change_positions():
     assert errors[-0.2] < 1.15 * errors[0.0]
 
 
-def test_large_constant_errors_of_raw_ranges_do_not_make_the_filter_follow_a_few_anchors():
+@pytest.mark.parametrize(
+    "errors_m",
+    [
+        (0.6, -0.8, 0.1, -0.2, -0.1, -0.1, -0.6, -0.1),
+        (0.5, 0.3, 0.4, -0.4, 0.3, -0.1, -0.1, 0.4),
+        (0.2, -0.2, 0.2, 0.0, -0.6, 0.4, 0.0, 0.2),
+    ],
+    ids=["large", "mostly long", "one short"],
+)
+def test_constant_errors_of_raw_ranges_do_not_make_the_filter_follow_a_few_anchors(errors_m):
     corners = anchors_at([(x, y, z) for x in (0.0, 12.0) for y in (0.0, 9.0) for z in (0.3, 2.5)])
     ranges, truth = drive(corners, rate_hz=80.0, seed=3)
-    ranges.range_m[:] += np.array([0.6, -0.8, 0.1, -0.2, -0.1, -0.1, -0.6, -0.1])[ranges.anchor]
+    ranges.range_m[:] += np.array(errors_m)[ranges.anchor]
     raw, height = replace(ranges, is_corrected=False), Height(1.0)
     live = TagEstimator(EstimatorConfig(corners, height=height)).run(raw)
     late = truth.take(truth.stamp_ns > 20 * NANOSECONDS)

@@ -232,6 +232,7 @@ class RobotEstimator:
             filter_.advance(time_s, point)
             if climbing is not None:
                 filter_.set_height(climbing.x.item(2), climbing.P.item(2, 2))
+            filter_.state.raw_factor = tag.raw_factor
             z, sd = filter_.update(*measurement[1:])
             if self._area is not None:
                 filter_.confine(self._area)

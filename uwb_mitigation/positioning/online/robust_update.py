@@ -93,7 +93,8 @@ class RobustUpdate:
         H: float64 (n,), derivatives of the next range with respect to the motion states, which the owner sets.
         estimates_errors: whether measurements change offset and errors, which are only considered otherwise.
         consistency: running mean of the second moments of the persisting errors, relative to the model; 1: they are as modelled.
-        raw_ratio: the same of raw ranges over a thousand ranges, relative to the model without the factor of `LARGE_RATIO`.
+        raw_factor: of the variance of raw ranges; the owner sets it.
+        raw_ratio: `consistency` of raw ranges over a thousand ranges, relative to the model without the factor of `LARGE_RATIO`.
         overcorrection: mean error of uncertain corrected ranges in their standard deviations; if negative, it is subtracted.
         residual_square: running mean of the products of two residuals of an anchor in a row, m^2: of their errors without noise.
     """
@@ -106,6 +107,7 @@ class RobustUpdate:
         # The inverse square of the unit at each anchor's latest range.
         self.error_unit, self._noise_until = 1.0, [1.0] * len(anchors)
         self.estimates_errors, self.consistency, self.raw_ratio = False, 1.0, 1.0
+        self.raw_factor = 1.0
         self.residual_square, self._last_residual = 0.0, [0.0] * len(anchors)
         self.overcorrection, self._num_uncertain = 0.0, MIN_UNCERTAIN
         self._constant_rows: dict[int, int] = {}
@@ -217,9 +219,11 @@ class RobustUpdate:
         self._is_raw[anchor] = not is_corrected
         model, x, H, P, k = self._model, self.x, self.H, self.P, self._offset
         row, factor = k + 1 + anchor, 1.0
-        # A condition is faster here than `max`.
-        if self.raw_ratio > LARGE_RATIO and not is_corrected:
-            factor = min(self.raw_ratio / LARGE_RATIO, MAX_RATIO)
+        if not is_corrected:
+            factor = self.raw_factor
+            # A condition is faster here than `max`.
+            if self.raw_ratio > LARGE_RATIO * factor:
+                factor = min(self.raw_ratio / LARGE_RATIO, MAX_RATIO)
         variance, error_variance = factor * model.variance(variance_m2), self._error_variance[anchor]
         unit = self.error_unit
         noise_until = 1.0 / (unit * unit)

@@ -44,6 +44,14 @@ TOO_SHORT = 10.0
 make ranges shorter, and one such anchor alone does not spoil the position. Largest values with right anchors: 6.0 (six Hanyang runs),
 2.1 (30 simulated drives); with two of five swapped, 24 or more for seven of ten pairs."""
 
+SHORT_MEAN, TYPICAL_MEAN = 0.5, 0.25
+"""Obstacles only lengthen ranges. If the mean normalised innovation of an anchor is below minus the first value and the median magnitude of
+those of all anchors is above the second one, anchors have larger constant errors than the model: the variance of raw ranges grows until
+this ends. Otherwise the robust loss follows anchors that agree by chance. Chosen in 17 drives past random anchors, and in `box`."""
+
+WIDENING, MAX_WIDENING = 0.1, 9.0
+"""Change of the logarithm of this factor in 0.25 s, if the means are twice these values, and its limit: constant errors of 0.3 m."""
+
 OBSTACLE_S = 1.5
 """If the ranges of exactly half of the anchors are too long, obstacles are the reason unless it lasts longer. Chosen in drives behind
 concrete as in `docs/experiments/when_worth_it.py`, with other seeds."""
@@ -103,6 +111,7 @@ class TagEstimator:
             `TOO_SHORT` says (`too short`).
         innovation_mean, innovation_square: running means over about a hundred ranges: of the normalised innovation, and of
             its square (1 is ideal).
+        raw_factor: of the variance of raw ranges, see `SHORT_MEAN`.
         filter: the filter that follows the tag; None: its position is searched.
         images: other positions that explain the ranges; checked four times per second.
         undetermined: the ranges do not determine the horizontal position at all.
@@ -116,7 +125,7 @@ class TagEstimator:
     def __init__(self, config: EstimatorConfig) -> None:
         self.anchors = config.anchors
         self.counts: Counter[str] = Counter()
-        self.innovation_mean, self.innovation_square = 0.0, 1.0
+        self.innovation_mean, self.innovation_square, self.raw_factor = 0.0, 1.0, 1.0
         self.config, self._model = config, config.model
         self.images = AmbiguityCheck(config)
         self._height, self._area = config.height, config.area
@@ -275,7 +284,8 @@ class TagEstimator:
         self.innovation_mean += 0.01 * (limited - self.innovation_mean)
         self.innovation_square += 0.01 * (limited * limited - self.innovation_square)
         self.counts["too short"] += self._is_short
-        short = limited if limited < 0.0 else 0.0
+        # Wrong anchor positions also widen the variance, but must be reported.
+        short = limited * math.sqrt(self.raw_factor) if limited < 0.0 else 0.0
         state = self._states[measurement.anchor]
         state.short_square += 0.02 * (short * short - state.short_square)
         state.outliers += 0.1 * ((abs(z) > OUTLIER) - state.outliers)
@@ -287,6 +297,9 @@ class TagEstimator:
             received, was_ambiguous = self.received_anchors(), self.is_ambiguous
             self._is_short = sum(self._states[row].short_square > TOO_SHORT for row in received) > 1
             filter_.factor = CONTRADICTED_FACTOR if self.is_contradicted else 1.0
+            if len(received) > 3:
+                self._adapt_variance([self._states[row].mean_z for row in received])
+                filter_.state.raw_factor = self.raw_factor
             if self._detect_loss(received):
                 self.counts["lost"] += 1
                 self._losses_s.append(self._time_s)
@@ -298,6 +311,13 @@ class TagEstimator:
                 self._ambiguous_s = self._time_s
             if was_ambiguous and not self.is_ambiguous and self._time_s > self._ambiguous_s + MAX_AMBIGUOUS_S:
                 self._restart_search(self._time_s - WINDOW_S)
+
+    def _adapt_variance(self, means: list[float]) -> None:
+        """Adapt the variance of raw ranges to the mean normalised innovations of the anchors."""
+        typical = sorted(map(abs, means))[len(means) // 2]
+        excess = min(-min(means) / SHORT_MEAN, typical / TYPICAL_MEAN) - 1.0
+        factor = self.raw_factor * math.exp(WIDENING * min(excess, 1.0))
+        self.raw_factor = min(max(factor, 1.0), MAX_WIDENING)
 
     def _detect_loss(self, received: list[int]) -> bool:
         """Return whether ranges of at least half of the received anchors contradict the filter, and obstacles are not the reason."""
