@@ -44,6 +44,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
+import os
 import re
 import tempfile
 import time
@@ -259,7 +260,7 @@ def main() -> None:
     choice.add_argument("--check", action="store_true")
     choice.add_argument("--truth", action="store_true")
     parser.add_argument("--force", action="store_true")
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
+    parser.add_argument("--data", type=Path, default=os.environ.get("UWB_MITIGATION_DATA", "../shared/data"))
     parser.add_argument("-o", "--output", type=Path)
     arguments = parser.parse_args()
     accepted: dict[str, list[dict[str, Any]]] = defaultdict(list)

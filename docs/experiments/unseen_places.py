@@ -63,8 +63,7 @@ for path in map(Path, sys.argv[2:]):
     residuals = found.errors["universal_los_offset"]
     for label in ("", *np.unique(data.labels)):
         label_rows = (data.labels == label) | (label == "")
-        variance = found.variance_m2[label_rows]
-        coverage68, coverage95 = (
-            coverage(residuals[label_rows], variance, sigmas) for sigmas in (1.0, found.sigmas95)
-        )
+        errors_m, variance = residuals[label_rows], found.variance_m2[label_rows]
+        coverage68 = coverage(errors_m, variance, 1.0)
+        coverage95 = coverage(errors_m, variance, found.sigmas95[label_rows])
         print(f"  intervals cover, {label or 'all':10}{coverage68:.1%} and {coverage95:.1%}")
