@@ -149,8 +149,7 @@ def test_large_and_fractional_cirs_are_scaled(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("ids", "rule"),
-    [(("9007199254740993", "9007199254740992"), {}), (("hall", "lab"), {"names": True})],
+    ("ids", "rule"), [(("9007199254740993", "9007199254740992"), {}), (("hall", "lab"), {"names": True})]
 )
 def test_a_cir_is_joined_by_large_and_named_ids(ids: Any, rule: Any, tmp_path: Path):
     first, second = ids

@@ -85,12 +85,7 @@ SIMULATED = ("", ["--height", "0", "--odometry", "/odom", "--imu", "/imu"],
     ids=["hanyang", "labyrinth processed", "simulated", "simulated processed"],
 )  # fmt: skip
 def test_track_and_view_give_the_same_figures(
-    imported,
-    tmp_path: Path,
-    source: str,
-    options: list[str],
-    settings: TrackSettings,
-    processed: bool,
+    imported, tmp_path: Path, source: str, options: list[str], settings: TrackSettings, processed: bool
 ):
     bag = imported(source)
     if processed:

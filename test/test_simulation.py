@@ -8,14 +8,7 @@ import pytest
 
 from uwb_mitigation.simulation import scene
 from uwb_mitigation.simulation.channel import CHANNEL_2, CHANNELS, Multipath, direct_power_db
-from uwb_mitigation.simulation.radio import (
-    NOISE_TAPS,
-    POWER_CONSTANT_DB,
-    TAP_NS,
-    TAPS,
-    Receiver,
-    pulse,
-)
+from uwb_mitigation.simulation.radio import NOISE_TAPS, POWER_CONSTANT_DB, TAP_NS, TAPS, Receiver, pulse
 from uwb_mitigation.simulation.simulated import SimulatedSource
 
 QUIET = Receiver(range_offset_m=0.0, timestamp_std_m=0.0)

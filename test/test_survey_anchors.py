@@ -45,11 +45,7 @@ MOVED = HALL.position + np.outer(np.arange(5) == 2, (0.4, 0.3, 0.0))
 
 @pytest.mark.parametrize(
     ("position", "misplaced", "swapped"),
-    [
-        (HALL.position, [], []),
-        (MOVED, [2], []),
-        (HALL.position[[0, 3, 2, 1, 4]], [1, 3], [(1, 3)]),
-    ],
+    [(HALL.position, [], []), (MOVED, [2], []), (HALL.position[[0, 3, 2, 1, 4]], [1, 3], [(1, 3)])],
 )
 def test_only_anchors_at_wrong_positions_are_named(minute, position, misplaced, swapped):
     found = survey_anchors(EstimatorConfig(HALL.moved(position, HALL.sd), height=LEVEL), minute)
