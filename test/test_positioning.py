@@ -135,7 +135,6 @@ def test_corrections_that_are_wrong_behind_thin_walls_hardly_change_positions():
         (0.5, 0.3, 0.4, -0.4, 0.3, -0.1, -0.1, 0.4),
         (0.2, -0.2, 0.2, 0.0, -0.6, 0.4, 0.0, 0.2),
     ],
-    ids=["large", "mostly long", "one short"],
 )
 def test_constant_errors_of_raw_ranges_do_not_make_the_filter_follow_a_few_anchors(errors_m):
     corners = anchors_at([(x, y, z) for x in (0.0, 12.0) for y in (0.0, 9.0) for z in (0.3, 2.5)])

@@ -30,16 +30,9 @@ from uwb_mitigation.recordings.bag.reader import BagReader
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.types.anchors import Anchor, AnchorMap, anchors_path, dump_anchors, load_anchors
 from uwb_mitigation.types.measurement import Cir, RangeMeasurement, Record
+from uwb_mitigation.types.ros import topics
 from uwb_mitigation.types.ros.codec import encode_range
 from uwb_mitigation.types.ros.poses import encode_pose, encode_true_position, tag_topic
-from uwb_mitigation.types.ros.topics import (
-    ODOMETRY_TRUTH,
-    ODOMETRY_TYPE,
-    POSE,
-    POSE_TYPE,
-    RANGE_CIR_TYPE,
-    RANGE_RAW,
-)
 from uwb_mitigation.types.tracks import Estimate
 from uwb_mitigation.viewer import texts
 from uwb_mitigation.viewer.feed import SceneUpdater
@@ -67,10 +60,10 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
             if number % 10 == 0:
                 stamp_ns = item.measurement.stamp_ns
                 place = Estimate(stamp_ns, np.array([number / 100, 1.0, 0.0]), np.zeros(3), np.eye(6) * 0.01)
-                out.write_message(POSE, POSE_TYPE, encode_pose(place), stamp_ns)
-                out.write_message(tag_topic(POSE, 9), POSE_TYPE, encode_pose(place), stamp_ns)
+                out.write_message(topics.POSE, topics.POSE_TYPE, encode_pose(place), stamp_ns)
+                out.write_message(tag_topic(topics.POSE, 9), topics.POSE_TYPE, encode_pose(place), stamp_ns)
                 true = encode_true_position((number / 100, 1.5, 0.0), 7, stamp_ns)
-                out.write_message(ODOMETRY_TRUTH, ODOMETRY_TYPE, true, stamp_ns)
+                out.write_message(topics.ODOMETRY_TRUTH, topics.ODOMETRY_TYPE, true, stamp_ns)
     anchors = "anchors:\n  - {id: 1, x: 0, y: 0, z: 2}\n  - {id: 2, x: 5, y: 0, z: 2}\n"
     path.with_name("site.anchors.yaml").write_text(anchors)
     return path
@@ -239,9 +232,9 @@ def test_implausible_values_of_standard_messages_are_ignored() -> None:
         message = SimpleNamespace(
             header=header, pose=SimpleNamespace(pose=pose, covariance=[covariance] * 36)
         )
-        feed.add(POSE, message)
+        feed.add(topics.POSE, message)
         assert np.isnan(scene.tags["tag"][3:6]).all()
-    feed.add_encoded(RANGE_RAW, b"")
+    feed.add_encoded(topics.RANGE_RAW, b"")
     assert feed.malformed == 1
 
 
@@ -249,7 +242,10 @@ def test_bag_without_ranges_and_tracks_is_refused(tmp_path: Path):
     path = tmp_path / "one.mcap"
     with BagWriter(path, {}) as out:
         out.write_message(
-            ODOMETRY_TRUTH, ODOMETRY_TYPE, encode_true_position((0.0, 0.0, 0.0), 1, START_NS), START_NS
+            topics.ODOMETRY_TRUTH,
+            topics.ODOMETRY_TYPE,
+            encode_true_position((0.0, 0.0, 0.0), 1, START_NS),
+            START_NS,
         )
     with pytest.raises(RecordingError, match="no ranges and no tracks"):
         open_bag(path)
@@ -274,7 +270,7 @@ def test_several_namespaces_need_a_choice(tmp_path: Path):
         for number in range(4):
             data = encode_range(record(number).measurement)
             for board in ("left", "right"):
-                out.write_message(f"/{board}/uwb/range_raw", RANGE_CIR_TYPE, data, START_NS + number)
+                out.write_message(f"/{board}/uwb/range_raw", topics.RANGE_CIR_TYPE, data, START_NS + number)
     with pytest.raises(UwbMitigationError, match="--namespace with one of: '/left', '/right'"):
         open_bag(path)
     player, scene = open_bag(path, namespace="/left")
@@ -289,7 +285,7 @@ def test_index_of_a_drive_has_tracks_errors_and_residuals(tmp_path: Path, monkey
     anchors = load_anchors(anchors_path(bag))
     player, scene = open_bag(bag, anchors)
     timeline = whole = player.timeline
-    assert whole.ranges == sum(1 for _ in BagReader(bag).messages([RANGE_RAW]))
+    assert whole.ranges == sum(1 for _ in BagReader(bag).messages([topics.RANGE_RAW]))
     figures = {title: (value, text) for title, value, text in cards(View(scene, player=player), 101)}
     corrected, references = figures["Position RMSE, whole recording"]
     assert float(corrected.split()[0]) < 0.8 * float(re.search(r"raw \+ same filter: (\S+) m", references)[1])

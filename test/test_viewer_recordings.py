@@ -18,18 +18,8 @@ from uwb_mitigation.recordings import recorded_ranges
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.measurement import Status
-from uwb_mitigation.types.ros import codec
+from uwb_mitigation.types.ros import codec, topics
 from uwb_mitigation.types.ros.poses import encode_true_position
-from uwb_mitigation.types.ros.topics import (
-    ODOMETRY_TRUTH,
-    ODOMETRY_TYPE,
-    RANGE_CIR_TYPE,
-    RANGE_CORRECTED,
-    RANGE_CORRECTED_TYPE,
-    RANGE_RAW,
-    RANGE_TRUTH,
-    RANGE_TRUTH_TYPE,
-)
 from uwb_mitigation.viewer.figures import MAX_POINTS, thinned
 from uwb_mitigation.viewer.headline import Positions
 from uwb_mitigation.viewer.histories import Pose, Sample
@@ -63,7 +53,7 @@ def write_drive(
     """
     ranges, truth = drive(seconds=40.0, rate_hz=25.0)
     with BagWriter(path, {}) as out:
-        channel = out.channel(RANGE_CORRECTED, RANGE_CORRECTED_TYPE)
+        channel = out.channel(topics.RANGE_CORRECTED, topics.RANGE_CORRECTED_TYPE)
         for tag, delay_s in delays_s.items():
             for row in range(len(ranges)):
                 time_s = ranges.stamp_ns[row] / 1e9
@@ -86,7 +76,7 @@ def write_drive(
                     "/uwb/range_truth", "uwb_mitigation_msgs/msg/RangeTruth", true_range, log_ns
                 )
                 place = encode_true_position(tuple(truth.position[row].tolist()), tag, stamp_ns)
-                out.write_message(ODOMETRY_TRUTH, ODOMETRY_TYPE, place, log_ns)
+                out.write_message(topics.ODOMETRY_TRUTH, topics.ODOMETRY_TYPE, place, log_ns)
     return path
 
 
@@ -207,9 +197,14 @@ def test_truths_and_levels_may_follow_all_ranges_and_have_no_samples(tmp_path: P
             cir = replace(item.measurement.cir, samples=np.zeros(0, np.int16))
             measurement = replace(item.measurement, cir=cir)
             log_ns = START_NS + count * STEP_NS
-            out.write_message(RANGE_RAW, RANGE_CIR_TYPE, codec.encode_range(measurement), log_ns)
             out.write_message(
-                RANGE_TRUTH, RANGE_TRUTH_TYPE, codec.encode_truth(measurement, item.truth), log_ns
+                topics.RANGE_RAW, topics.RANGE_CIR_TYPE, codec.encode_range(measurement), log_ns
+            )
+            out.write_message(
+                topics.RANGE_TRUTH,
+                topics.RANGE_TRUTH_TYPE,
+                codec.encode_truth(measurement, item.truth),
+                log_ns,
             )
     whole = indexed(tmp_path / "late.mcap").all_data
     assert whole.errors == count
