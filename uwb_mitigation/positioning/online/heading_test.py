@@ -52,9 +52,6 @@ STEP_M, EVERY_M, SHORTEST_M, FEWEST = 0.2, 1.5, 3.0, 8
 ERROR_M, UNSEEN_M = 0.12, 0.05
 """Standard deviations of positions that are added to the residuals of fits: to compare them, and for the variance of the heading."""
 
-TURNING_SHARE = 0.6
-"""Share of the variance of positions that changes along their path and turns it. Chosen on simulated drives with seeds 20 to 35."""
-
 SCALE_LIMITS = 0.9, 1.1
 """Of distances in the odometry."""
 
@@ -70,8 +67,8 @@ MAX_FIT_SD = math.radians(8.0)
 KNOWN_YAW_SD = math.radians(15.0)
 """A heading is searched, or not confirmed, while its standard deviation is larger; `LATE_SD` is in addition."""
 
-LATE_SD, STEADY_LATE_SD, STEADY = math.radians(45.0), math.radians(5.5), 2.5
-"""Least standard deviation of a heading until late stamps are excluded: in the time of the delay a robot can turn by 140 degrees, which
+LATE_SD, STEADY_LATE_SD, STEADY = math.radians(30.0), math.radians(5.5), 2.5
+"""Least standard deviation of a heading until late stamps are excluded: in the time of the delay a robot can turn by 90 degrees, which
 neither the odometry nor the ranges show at once. The second is for one that turns steadily: its yaw rates differ by a smaller factor."""
 
 RATE_S = 0.5
@@ -102,7 +99,7 @@ class HeadingTest:
         self._samples: deque[tuple[complex, ...]] = deque(maxlen=400)
         self._last: PathPoint | None = None
         self._path = [0j] * len(_FAULTS)
-        self._fitted_m, self._variance, self._bias, self._drift = 0.0, math.inf, 0.0, 0.0
+        self._fitted_m, self._variance, self._drift = 0.0, math.inf, 0.0
         self._rotation: float | None = None
         self._judge()
 
@@ -155,14 +152,13 @@ class HeadingTest:
         if point.distance_m - self._fitted_m >= EVERY_M:
             self._fit()
 
-    def variance(self, yaw: float, variance: float, point: PathPoint, factor: float = 1.0) -> float:
+    def variance(self, yaw: float, variance: float, point: PathPoint) -> float:
         """Return the variance of a heading, rad^2; inf: it is not confirmed.
 
         Args:
             yaw: heading of the base, rad, from odometry and ranges.
             variance: of it, if the odometry has no fault, rad^2.
             point: of the odometry at this time.
-            factor: of the variance if late stamps are excluded.
         """
         self.contradicts = False
         if self._rotation is None:
@@ -173,7 +169,6 @@ class HeadingTest:
         variance = max(variance, self._variance, (difference / FIT_SD) ** 2)
         if self.contradicts or not self._is_confirmed or variance >= KNOWN_YAW_SD**2:
             return math.inf
-        variance = factor * max(variance, self._bias)
         if not self.may_be_late:
             return variance
         # With both signs the right side is negative.
@@ -225,11 +220,8 @@ class HeadingTest:
         evidence = self._evidence + np.clip(gain, -most, most)[1:]
         self._evidence = np.minimum(evidence, MOST_EVIDENCE).tolist()
         self._fitted_m, self._rotation = float(distance_m[-1]), float(np.angle(rotation[0]))
-        # Errors of ranges persist: averaging does not reduce the variance of the rotation, and residuals do not show those that turn
-        # the path.
-        spread = float(np.mean(np.abs(position) ** 2))
-        self._variance = float(square[0] + UNSEEN_M**2) / (2.0 * spread)
-        self._bias = TURNING_SHARE * float(np.mean(variance[fitted])) / spread
+        # Errors of ranges persist: averaging does not reduce the variance of the rotation.
+        self._variance = float(square[0] + UNSEEN_M**2) / (2.0 * float(np.mean(np.abs(position) ** 2)))
         # From the beginning of the fitted path until now.
         self._drift = sum(float(drift[-1] - drift[fitted.start]) ** 2 for drift in drifts)
         self._judge()
