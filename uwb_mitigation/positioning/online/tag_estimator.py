@@ -285,11 +285,12 @@ class TagEstimator:
         self.innovation_square += 0.01 * (limited * limited - self.innovation_square)
         self.counts["too short"] += self._is_short
         # Wrong anchor positions also widen the variance, but must be reported.
-        short = limited * math.sqrt(self.raw_factor) if limited < 0.0 else 0.0
+        unwidened = z if measurement.is_corrected else z * math.sqrt(filter_.state.raw_factor)
+        short = max(min(unwidened, 0.0), -10.0)
         state = self._states[measurement.anchor]
         state.short_square += 0.02 * (short * short - state.short_square)
-        state.outliers += 0.1 * ((abs(z) > OUTLIER) - state.outliers)
-        state.short += 0.1 * ((z < -OUTLIER) - state.short)
+        state.outliers += 0.1 * ((abs(unwidened) > OUTLIER) - state.outliers)
+        state.short += 0.1 * ((unwidened < -OUTLIER) - state.short)
         limited = z if -5.0 < z < 5.0 else math.copysign(5.0, z)
         state.mean_z += 0.02 * (limited - state.mean_z)
         if self._time_s >= self._next_check_s:
@@ -297,9 +298,8 @@ class TagEstimator:
             received, was_ambiguous = self.received_anchors(), self.is_ambiguous
             self._is_short = sum(self._states[row].short_square > TOO_SHORT for row in received) > 1
             filter_.factor = CONTRADICTED_FACTOR if self.is_contradicted else 1.0
-            if len(received) > 3:
-                self._adapt_variance([self._states[row].mean_z for row in received])
-                filter_.state.raw_factor = self.raw_factor
+            self._adapt_variance([self._states[row].mean_z for row in received])
+            filter_.state.raw_factor = self.raw_factor
             if self._detect_loss(received):
                 self.counts["lost"] += 1
                 self._losses_s.append(self._time_s)
@@ -314,8 +314,9 @@ class TagEstimator:
 
     def _adapt_variance(self, means: list[float]) -> None:
         """Adapt the variance of raw ranges to the mean normalised innovations of the anchors."""
-        typical = sorted(map(abs, means))[len(means) // 2]
-        excess = min(-min(means) / SHORT_MEAN, typical / TYPICAL_MEAN) - 1.0
+        excess = -1.0
+        if len(means) > 3:
+            excess += min(-min(means) / SHORT_MEAN, sorted(map(abs, means))[len(means) // 2] / TYPICAL_MEAN)
         factor = self.raw_factor * math.exp(WIDENING * min(excess, 1.0))
         self.raw_factor = min(max(factor, 1.0), MAX_WIDENING)
 

@@ -203,9 +203,11 @@ function start(doc) {
     // What the page shows may be wrong by now.
     $("verdict").style.display = $("intervals").style.display = "none";
     $("age").hidden = true;
-    // The script, because the server makes a session for each request of the page; one request at a time.
+    // The script, because the server makes a session for each request of the page; one request at a time, with the token.
+    const script = new URL(document.querySelector("script[src*='bokeh.min.js']").src);
+    script.search += location.search.replace("?", "&");
     const wait = async () => {
-      try { if ((await fetch(document.querySelector("script[src]").src, {method: "HEAD", cache: "no-store"})).ok) { location.reload(); return; } }
+      try { if ((await fetch(script, {method: "HEAD", cache: "no-store", signal: AbortSignal.timeout(5000)})).ok) { location.reload(); return; } }
       catch { /* not yet */ }
       setTimeout(wait, 1000);
     };
