@@ -191,8 +191,8 @@ def separation(
 
 def constant_error_gain(
     anchors: NDArray[np.float64], position: NDArray[np.float64], dims: int, offset_sd_m: float
-) -> tuple[NDArray[np.float64], float]:
-    """Return the covariance of a position float64 (3,) for constant errors of the ranges, and the share of redundant ranges.
+) -> NDArray[np.float64]:
+    """Return the covariance of a position float64 (3,) for constant errors of the ranges.
 
     These are the sensitivities of least squares for a position and a common offset, for independent errors with a variance of 1.
 
@@ -208,11 +208,9 @@ def constant_error_gain(
     prior = [(CONSTANT_ERROR_M / sd) ** 2 for sd in (*POSITION_SD_M[:dims], max(offset_sd_m, 1e-3))]
     normal.reshape(-1)[:: dims + 2] += prior
     gain = np.linalg.solve(normal, rows.T)
-    residual = rows @ gain
-    residual.reshape(-1)[:: len(anchors) + 1] -= 1.0
     covariance = np.zeros((3, 3))
     covariance[:dims, :dims] = gain[:dims] @ gain[:dims].T
-    return covariance, float(np.vdot(residual, residual)) / len(anchors)
+    return covariance
 
 
 def dop(anchors: NDArray[np.float64], position: NDArray[np.float64], *, level: bool = False) -> Dop:

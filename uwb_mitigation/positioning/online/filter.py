@@ -15,7 +15,7 @@ from scipy.linalg.blas import dscal
 
 from uwb_mitigation.positioning.geometry import Symmetry
 from uwb_mitigation.positioning.noise_model import NoiseModel
-from uwb_mitigation.positioning.online.robust_update import SHORTEST_M, RobustUpdate
+from uwb_mitigation.positioning.online.robust_update import COVARIANCE_SCALE, SHORTEST_M, RobustUpdate
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.tracks import Estimate
 
@@ -152,7 +152,7 @@ class RangeFilter:
         state = self.state
         # In place and contiguous, which takes a third of the time.
         x, covariance = state.x, state.P[:6, :6].copy()
-        dscal(self.factor * state.covariance_scale(), covariance.reshape(-1))
+        dscal(self.factor * COVARIANCE_SCALE, covariance.reshape(-1))
         covariance += self.unseen
         return x[:3].copy(), x[3:6].copy(), covariance
 

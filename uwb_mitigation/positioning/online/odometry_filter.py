@@ -18,7 +18,7 @@ from uwb_mitigation.positioning.geometry import Area
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.dead_reckoning import DeadReckoning, PathPoint
 from uwb_mitigation.positioning.online.filter import RangeFilter
-from uwb_mitigation.positioning.online.robust_update import SHORTEST_M
+from uwb_mitigation.positioning.online.robust_update import COVARIANCE_SCALE, SHORTEST_M
 from uwb_mitigation.types.anchors import AnchorMap
 
 YAW, SCALE, DRIFT, TURN, MOTION = 3, 4, 5, 6, 7
@@ -158,7 +158,7 @@ class OdometryFilter:
         (xx, xy, _, x_yaw), (_, yy, _, y_yaw), _, (_, _, _, yaw_yaw) = self.state.P[:SCALE, :SCALE].tolist()
         arm_x, arm_y = self._arm(yaw)
         # Only the position: the heading depends on the odometry more than on errors of ranges.
-        scale = self.state.covariance_scale()
+        scale = COVARIANCE_SCALE
         root = math.sqrt(scale)
         return (
             x + arm_x,

@@ -4,8 +4,8 @@ State: motion (0 to k - 1), the offset that the tag's ranges have in common (k),
 (k + 1, ...), and behind them the constant errors of up to `MAX_CONSTANT` anchors. While the position is searched, offset and
 errors are only considered (S. F. Schmidt, 1966): they keep their uncertainty and their correlations, so that no candidate
 position explains its ranges by wrong offsets. Afterwards they are estimated. Only ranges that a model corrected have constant
-errors as states: those of raw ranges would follow obstacles, also if their variance is known. The variance of what remains is estimated from
-residuals, see `persisting_variance`, and widens the published covariance.
+errors as states: those of raw ranges would follow obstacles, also if their variance is known. The mean square of the
+residuals widens the published covariance, see `persisting_variance`.
 """
 
 from __future__ import annotations
@@ -46,35 +46,31 @@ and 700 to 703, where 400 to 4,000 are equal."""
 MAX_CONSTANT = 16
 """With more anchors, the one whose constant error has been estimated for longest is forgotten: the state remains small."""
 
-CONSISTENCY_RATE = 0.01
-"""Share of a new range in the running mean `consistency`: it includes about a hundred ranges."""
-
 MAX_RATIO = 9.0
-"""Limit of the contribution of a range to `consistency`: a single anchor with a large error must not dominate it."""
+"""Limit of the contribution of a range to `raw_ratio`: a single anchor with a large error must not dominate it."""
 
 LARGE_RATIO = 2.0
 """Raw ranges whose persisting errors have a larger mean second moment relative to the model get a larger variance, until it is this
 one. Otherwise the robust loss follows the anchors that agree by chance, if anchors have constant errors of 0.3 m. Chosen on
 development seeds of the layout `box`; the RMSE of 26 drives in other layouts, sites and halls is the same to 1 mm."""
 
-SCALE, POWER, MIN_SCALE, MAX_SCALE = 2.2, 4.0, 0.2, 12.0
-"""See `RobustUpdate.covariance_scale`."""
+RATIO_RATE = 0.001
+"""Share of a new range in the running mean `raw_ratio`: it includes about a thousand ranges."""
 
-OFFSET_SCALE = 4.0
-"""Smallest factor of the part of published covariances from the common offset: small persisting errors say nothing about it. With
-`SCALE` instead, four of a hundred development runs (simulated drives, Hanyang, labyrinth) exceed protection levels in 0.5 %, with
-this value two. On held-out layouts both have six of eighty."""
+COVARIANCE_SCALE = 1.5
+"""Factor of P in published covariances."""
 
-RESIDUAL_RATE = 0.001
-"""As `CONSISTENCY_RATE`, for products of residuals: a thousand ranges, because most of their errors are constant."""
+RESIDUAL_SCALE = 1.75
+"""Variance of persisting errors relative to the mean square of residuals: a fit of a position and an offset to seven anchors hides three
+sevenths of it. Published covariances contain twice as much, see `ambiguity.CAUTION`."""
+
+RESIDUAL_RATE, SHORTEST_RESIDUAL_M, LONGEST_RESIDUAL_M = 0.012, -1.5, 0.5
+"""Share of a new range in `residual_square`, and limits of the residuals: longer ones are obstacles, which the robust loss excludes."""
 
 MIN_UNIT, MAX_ELAPSED = 1e-3, 100.0
 """Limits of `RobustUpdate.error_unit`, and of the time constants of one prediction."""
 
 _ONES = np.ones(3)
-
-PRIOR_SHARE = 0.05
-"""Weight of the modelled variance of persisting errors among these: that of ranges of which this share is redundant."""
 
 
 class RobustUpdate:
@@ -92,9 +88,9 @@ class RobustUpdate:
         moments: float64 (n + 1, n), P and below it x, which are views of it: many operations are the same for both.
         H: float64 (n,), derivatives of the next range with respect to the motion states, which the owner sets.
         estimates_errors: whether measurements change offset and errors, which are only considered otherwise.
-        consistency: running mean of the second moments of the persisting errors, relative to the model; 1: they are as modelled.
         raw_factor: of the variance of raw ranges; the owner sets it.
-        raw_ratio: `consistency` of raw ranges over a thousand ranges, relative to the model without the factor of `LARGE_RATIO`.
+        raw_ratio: running mean of the second moments of the persisting errors of raw ranges, relative to the model without the factor of
+            `LARGE_RATIO`; 1: they are as modelled.
         overcorrection: mean error of uncertain corrected ranges in their standard deviations; if negative, it is subtracted.
         residual_square: running mean of the products of two residuals of an anchor in a row, m^2: of their errors without noise.
     """
@@ -106,8 +102,7 @@ class RobustUpdate:
         self._error_variance: list[float] = ((1.0 - model.white) * model.range_sd**2 + anchors.sd**2).tolist()
         # The inverse square of the unit at each anchor's latest range.
         self.error_unit, self._noise_until = 1.0, [1.0] * len(anchors)
-        self.estimates_errors, self.consistency, self.raw_ratio = False, 1.0, 1.0
-        self.raw_factor = 1.0
+        self.estimates_errors, self.raw_ratio, self.raw_factor = False, 1.0, 1.0
         self.residual_square, self._last_residual = 0.0, [0.0] * len(anchors)
         self.overcorrection, self._num_uncertain = 0.0, MIN_UNCERTAIN
         self._constant_rows: dict[int, int] = {}
@@ -248,27 +243,22 @@ class RobustUpdate:
                 self._num_uncertain = min(self._num_uncertain + 1, MAX_UNCERTAIN)
                 error = min(max(error_m / range_sd, -1.0), 3.0)
                 self.overcorrection += (error - self.overcorrection) / self._num_uncertain
-        innovation = residual - unit * x.item(row)
         if is_corrected:
             H[constant] = 1.0
-            innovation -= x.item(constant)
+            residual -= x.item(constant)
             # Near an anchor the distance is not linear in the position: variance of its second-order term (Bar-Shalom, Li,
             # Kirubarajan, 10.3.2). Otherwise the filter may continue on the other side of an anchor that it passes.
             curvature = (P.item(0, 0) + P.item(1, 1)) / max(distance_m, SHORTEST_M)
             white += 0.5 * curvature * curvature
-        z, sd = self.update(H, innovation, white)
-        limit = model.long if z > 0.0 else -model.short
-        if z / limit > 1.0:
-            # The square root of the factor of the variance.
-            residual *= limit / z
+        z, sd = self.update(H, residual - unit * x.item(row), white)
+        residual = min(max(residual, SHORTEST_RESIDUAL_M), LONGEST_RESIDUAL_M)
         # White noise does not contribute to the mean of this product.
         square = residual * self._last_residual[anchor]
         self._last_residual[anchor] = residual
         self.residual_square += RESIDUAL_RATE * (square - self.residual_square)
-        ratio = min((x.item(row) ** 2 + P.item(row, row)) / (noise_until * error_variance), MAX_RATIO)
-        self.consistency += CONSISTENCY_RATE * (ratio - self.consistency)
         if not is_corrected:
-            self.raw_ratio += RESIDUAL_RATE * (factor * ratio - self.raw_ratio)
+            ratio = min((x.item(row) ** 2 + P.item(row, row)) / (noise_until * error_variance), MAX_RATIO)
+            self.raw_ratio += RATIO_RATE * (factor * ratio - self.raw_ratio)
         return z, sd
 
     def update(
@@ -306,35 +296,11 @@ class RobustUpdate:
             K[self._offset :] = 0.0
         self.x -= K * (self.x[axis] - value)
 
-    @property
-    def modelled_variance(self) -> float:
-        """Mean variance of the persisting errors in the model, m^2."""
-        return sum(self._error_variance) / len(self._error_variance)
-
     def constant_variance(self, rows: Sequence[int]) -> float:
         """Return the variance of constant errors that are not states, m^2: those of the received `rows` whose latest range was raw."""
         is_raw = [self._is_raw[row] for row in rows if row in self._is_raw] or [True]
         return CONSTANT_SD**2 * (sum(is_raw) / len(is_raw))
 
-    def persisting_variance(self, redundancy: float) -> float:
-        """Return the variance of the errors that do not average out, m^2, for the share of redundant ranges."""
-        square = max(self.residual_square, 0.0) + PRIOR_SHARE * self.modelled_variance
-        return square / (redundancy + PRIOR_SHARE)
-
-    def covariance_scale(self) -> float:
-        """Return the factor of published covariances.
-
-        The filter sees only a part of the persisting errors, so that their true variance differs from the model by more than
-        `consistency`. The power and the limits were chosen on simulated drives, the Hanyang runs and the labyrinth.
-        """
-        scale = SCALE * math.pow(self.consistency, POWER)
-        return scale if MIN_SCALE < scale < MAX_SCALE else min(max(scale, MIN_SCALE), MAX_SCALE)
-
-    def hidden_offset_covariance(self) -> NDArray[np.float64]:
-        """Return what a position's published covariance (3, 3) lacks of the common offset, m^2.
-
-        Its part from the offset is multiplied by `OFFSET_SCALE` at least.
-        """
-        variance, by_offset = self.P.item(self._offset, self._offset), self.P[:3, self._offset]
-        share = max(OFFSET_SCALE - self.covariance_scale(), 0.0) / max(variance, 1e-12)
-        return share * np.multiply.outer(by_offset, by_offset)
+    def persisting_variance(self) -> float:
+        """Return the variance of the errors that do not average out, m^2."""
+        return RESIDUAL_SCALE * max(self.residual_square, 0.0)
