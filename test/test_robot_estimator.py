@@ -375,12 +375,29 @@ def test_smoothed_track_has_headings_from_the_start():
     assert rms(distance) < rms(robot.errors(live)[0])
 
 
-def test_first_sharp_turn_with_late_odometry_does_not_exceed_the_heading(data: Path):
-    run = load_geometry("hall", "24", str(data / "geometries" / GEOMETRIES), "ceiling_hall", 2, 24, 60.0)
+@pytest.mark.parametrize(
+    ("layout", "seed", "seconds", "late_s"),
+    [
+        # A sharp turn that neither the odometry nor the ranges show yet.
+        ("ceiling_hall", 11, 120.0, 1.0),
+        ("ceiling_hall", 24, 60.0, 1.0),
+        # Not late enough to be excluded as such.
+        ("level_square_small", 23, 120.0, 0.3),
+        # Range errors that are larger than modelled, and those that turn the path.
+        ("corridor", 23, 120.0, 0.0),
+        ("corridor", 30, 120.0, 0.0),
+    ],
+)
+def test_heading_contains_errors(data: Path, layout: str, seed: int, seconds: float, late_s: float):
+    run = load_geometry("", "", str(data / "geometries" / GEOMETRIES), layout, 2, seed, seconds)
     assert run.robot is not None
-    late = replace(run.robot, odometry=odometry_faults(run.robot.odometry)["late by 1 s"])
-    exceeded = track_errors(locate(run, run.ranges, late), run.truth).heading_exceeded
-    assert not exceeded > 0.01
+    late = replace(run.robot.odometry, stamp_ns=run.robot.odometry.stamp_ns + round(late_s * NANOSECONDS))
+    track = locate(run, run.ranges, replace(run.robot, odometry=late))
+    assert not track_errors(track, run.truth).heading_exceeded > 0.01
+    known = track.take(np.isfinite(track.yaw[:, 4]))
+    assert np.all(known.yaw[:, 4] < math.radians(45.1) ** 2)
+    # The heading rotates the velocity of the odometry.
+    assert np.all(known.covariance[:, 3, 3] > known.yaw[:, 4] * np.sum(known.velocity[:, :2] ** 2, axis=1))
 
 
 def test_real_robot_reaches_the_documented_errors(data: Path):

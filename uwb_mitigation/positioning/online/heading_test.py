@@ -32,8 +32,9 @@ class _Fault(NamedTuple):
     delay_s: float = 0.0
 
 
-_FAULTS = (_Fault(), _Fault(gain=-1.0), _Fault(gain=-2.0, sign=-1.0), _Fault(delay_s=1.0))
-"""None; velocities in the axes of the world, whose relation to the heading is unknown; yaw rates with the wrong sign; late stamps."""
+_FAULTS = _Fault(), _Fault(gain=-1.0), _Fault(gain=-2.0, sign=-1.0), _Fault(delay_s=1.0), _Fault(delay_s=0.3)
+"""None; velocities in the axes of the world, whose relation to the heading is unknown; yaw rates with the wrong sign; late stamps;
+stamps that are slightly late: these only widen the variance."""
 
 _MAX_DELAY_S = max(fault.delay_s for fault in _FAULTS)
 
@@ -65,11 +66,15 @@ MAX_FIT_SD = math.radians(8.0)
 """A fit with a larger standard deviation confirms no heading."""
 
 KNOWN_YAW_SD = math.radians(15.0)
-"""A heading is searched, or not confirmed, while its standard deviation is larger; `LATE_SD` is in addition."""
+"""A heading is searched, or not confirmed, while its standard deviation is larger, without late stamps and separated positions."""
 
-LATE_SD, STEADY_LATE_SD, STEADY = math.radians(30.0), math.radians(5.5), 2.5
-"""Least standard deviation of a heading until late stamps are excluded: in the time of the delay a robot can turn by 90 degrees, which
-neither the odometry nor the ranges show at once. The second is for one that turns steadily: its yaw rates differ by a smaller factor."""
+LATE_SD, STEADY_LATE_SD, STEADY = math.radians(45.0), math.radians(5.5), 2.5
+"""Least standard deviation of a heading until late stamps are excluded: in the time of the delay a robot can turn by 140 degrees, which
+neither the odometry nor the ranges show at once. The second is for one that turns steadily: its yaw rates differ by a smaller factor.
+No heading with a larger standard deviation than the first is published."""
+
+STAMP_SD = 0.15, 0.05
+"""Standard deviation of the time between stamps of odometry and ranges, s: until slightly late stamps are excluded, and then."""
 
 RATE_S = 0.5
 """Averaging time of yaw rates."""
@@ -83,7 +88,7 @@ class HeadingTest:
 
     Args:
         lever_arm: the antenna in the frame of the base, m; only x and y are used.
-        is_verified: all faults were excluded before.
+        is_verified: all faults were excluded before, except for slightly late stamps.
 
     Attributes:
         contradicts: the latest heading contradicted the ranges, or the odometry has a fault.
@@ -92,7 +97,7 @@ class HeadingTest:
 
     def __init__(self, lever_arm: tuple[float, float, float], *, is_verified: bool = False) -> None:
         self._arm = complex(*lever_arm[:2])
-        self._evidence = [is_verified * evidence for evidence in (LATE_EVIDENCE, LATE_EVIDENCE, EXCLUDED)]
+        self._evidence = [is_verified * sum_ for sum_ in (LATE_EVIDENCE, LATE_EVIDENCE, EXCLUDED, 0.0)]
         self._slowest, self._fastest = math.inf, -math.inf
         self._turned, self.contradicts = (0.0, PathPoint(0)), False
         # Time, distance driven, variance, drift and turn of the odometry, position, and position relative to the start of the path for each fault.
@@ -152,13 +157,17 @@ class HeadingTest:
         if point.distance_m - self._fitted_m >= EVERY_M:
             self._fit()
 
-    def variance(self, yaw: float, variance: float, point: PathPoint) -> float:
+    def variance(
+        self, yaw: float, variance: float, point: PathPoint, yaw_rate: float = 0.0, factor: float = 1.0
+    ) -> float:
         """Return the variance of a heading, rad^2; inf: it is not confirmed.
 
         Args:
             yaw: heading of the base, rad, from odometry and ranges.
             variance: of it, if the odometry has no fault, rad^2.
             point: of the odometry at this time.
+            yaw_rate: in which errors of stamps turn the heading, rad/s.
+            factor: of the variance, if a wrong heading separated the positions of odometry and ranges.
         """
         self.contradicts = False
         if self._rotation is None:
@@ -166,18 +175,21 @@ class HeadingTest:
         difference = math.remainder(self._rotation + point.yaw - yaw, math.tau)
         limit = CONTRADICTION**2 * (variance + self._variance + self._drift)
         self.contradicts = self._is_faulty or difference * difference > limit
-        variance = max(variance, self._variance, (difference / FIT_SD) ** 2)
+        # The sum: errors of ranges that turn the path are in neither completely, and those of wheels that slip not at all.
+        variance = max(variance + self._variance, (difference / FIT_SD) ** 2)
         if self.contradicts or not self._is_confirmed or variance >= KNOWN_YAW_SD**2:
             return math.inf
-        if not self.may_be_late:
-            return variance
-        # With both signs the right side is negative.
-        is_steady = max(self._fastest, -self._slowest) < STEADY * max(self._slowest, -self._fastest)
-        return max(variance, (STEADY_LATE_SD if is_steady else LATE_SD) ** 2)
+        variance = factor * variance + (self._stamp_sd * yaw_rate) ** 2
+        if self.may_be_late:
+            # With both signs the right side is negative.
+            is_steady = max(self._fastest, -self._slowest) < STEADY * max(self._slowest, -self._fastest)
+            variance = max(variance, (STEADY_LATE_SD if is_steady else LATE_SD) ** 2)
+        return variance if variance <= LATE_SD**2 else math.inf
 
     def _judge(self) -> None:
         """Update what follows from evidence and fit: `variance` runs after each range."""
-        *others, late = self._evidence
+        *others, late, slightly_late = self._evidence
+        self._stamp_sd = STAMP_SD[slightly_late >= EXCLUDED]
         self._is_faulty, self.may_be_late = min(*others, late) < IDENTIFIED, late < EXCLUDED
         required = LATE_EVIDENCE if self.may_be_late else EXCLUDED
         self._is_confirmed = min(others) >= required and self._variance <= MAX_FIT_SD**2

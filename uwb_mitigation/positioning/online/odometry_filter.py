@@ -145,11 +145,14 @@ class OdometryFilter:
         # The projection has turned the lever arm.
         self.state.x[:3] += area.clip(np.array(self.antenna)) - self.antenna
 
-    def velocity(self, odometry: DeadReckoning) -> tuple[float, float, float]:
-        """Return the velocity of the antenna (m/s) and its variance in each axis (m^2/s^2), with the latest twist of the odometry."""
+    def velocity(self, odometry: DeadReckoning, yaw_variance: float) -> tuple[float, float, float]:
+        """Return the velocity of the antenna (m/s) and its variance in each axis (m^2/s^2), with the latest twist of the odometry.
+
+        The variance of the published heading is given in rad^2.
+        """
         (x, y, yaw_rate), yaw = odometry.twist or (0.0, 0.0, 0.0), self.state.x.item(YAW)
         (vx, vy), (arm_x, arm_y) = _rotated(x, y, yaw), self._arm(yaw)
-        variance = odometry.twist_variance[0] + self.yaw_variance * (x * x + y * y)
+        variance = odometry.twist_variance[0] + yaw_variance * (x * x + y * y)
         return vx - yaw_rate * arm_y, vy + yaw_rate * arm_x, variance
 
     def published(self) -> tuple[float, ...]:

@@ -96,7 +96,7 @@ class RobotEstimator:
         self._yaws: list[_HeadingHypothesis] = []
         self._begin: PathPoint | None = None
         self._is_rejected, self._is_confirmed, self._is_apart = False, False, False
-        self._rejections, self._separation = 0.0, 0.0
+        self._rejections, self._separation, self._latest_separation = 0.0, 0.0, 0.0
         self._test = HeadingTest(self._robot.lever_arm, is_verified=self._robot.is_verified)
         self._recorded = deque(sorted(self._recorded_motion(), key=lambda message: message[0]))
 
@@ -198,12 +198,15 @@ class RobotEstimator:
         if self._area is not None:
             position = self._area.clip(position)
         yaw = math.remainder(yaw, math.tau)
-        variance = self._test.variance(yaw, yaw_variance, heading_filter.point)
+        # A wrong heading separates the solutions by more than their covariances.
+        factor = max(self._separation, self._latest_separation, EQUAL_SEPARATION) / EQUAL_SEPARATION
+        yaw_rate = self.odometry.twist[2] if self.odometry.twist else 0.0
+        variance = self._test.variance(yaw, yaw_variance, heading_filter.point, yaw_rate, factor)
         # Ranges show a turn that late odometry hides first as a separation that averages do not contain yet.
         self._is_confirmed = variance < math.inf and not (self._is_apart and self._test.may_be_late)
         heading: Heading | None = None
         if self._is_confirmed:
-            velocity[0], velocity[1], speed_variance = heading_filter.velocity(self.odometry)
+            velocity[0], velocity[1], speed_variance = heading_filter.velocity(self.odometry, variance)
             covariance[3, 4] = covariance[4, 3] = 0.0
             covariance[3, 3] = covariance[4, 4] = speed_variance
             heading = Heading(yaw, np.array([weight * x_yaw, weight * y_yaw, 0.0, variance]))
@@ -251,6 +254,7 @@ class RobotEstimator:
         dx, dy = x - state.x.item(0), y - state.x.item(1)
         a, b, c = state.P.item(0, 0), state.P.item(0, 1), state.P.item(1, 1)
         separation = (c * dx * dx - 2.0 * b * dx * dy + a * dy * dy) / max(a * c - b * b, 1e-12)
+        self._latest_separation = separation
         if dt > 0.0:
             self._separation += min(dt / SEPARATION_S, 1.0) * (separation - self._separation)
             self._rejections *= math.exp(-dt / FORGIVEN_S)
