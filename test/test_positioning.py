@@ -141,10 +141,15 @@ def test_constant_errors_of_raw_ranges_do_not_make_the_filter_follow_a_few_ancho
     ranges, truth = drive(corners, rate_hz=80.0, seed=3)
     ranges.range_m[:] += np.array(errors_m)[ranges.anchor]
     raw, height = replace(ranges, is_corrected=False), Height(1.0)
-    live = TagEstimator(EstimatorConfig(corners, height=height)).run(raw)
+    locator = TagEstimator(EstimatorConfig(corners, height=height))
+    live = locator.run(raw)
     late = truth.take(truth.stamp_ns > 20 * NANOSECONDS)
     simple = track_errors(snapshot(corners, raw, height), late)
     assert track_errors(live, late).rmse < 1.1 * simple.rmse
+    assert locator.raw_factor > 1.5
+    three = raw.take(raw.anchor < 3)
+    locator.run(replace(three, stamp_ns=three.stamp_ns + 60 * NANOSECONDS))
+    assert locator.raw_factor == 1.0, "three anchors do not show constant errors"
 
 
 def test_number_of_constant_errors_is_bounded():
