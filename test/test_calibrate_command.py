@@ -252,7 +252,7 @@ def test_correction_is_selected_only_if_it_improves_each_drive():
 def test_correction_that_would_be_refused_is_not_selected_if_a_simpler_one_helps(range_m, live_m, refusal):
     block = np.arange(400) // 40
     residual_m = {name: np.full(400, value) for name, value in (("raw", 0.3), ("a", 0.2), ("b", range_m))}
-    errors_m = {"raw": np.ones(400), "a": np.full(400, 0.99), "b": np.where(block % 2, *live_m)}
+    errors_m = {"raw": np.ones(400), "a": np.where(block % 2, 0.98, 1.0), "b": np.where(block % 2, *live_m)}
     errors = HeldOut(block, residual_m, errors_m, True)
     assert errors.live_gain("b", "a").mean > -MAX_INCREASE
     assert select([errors], ["a", "b"], "raw") == "a"

@@ -3,6 +3,7 @@
 import errno
 import os
 import signal
+import termios
 import time
 from pathlib import Path
 
@@ -111,6 +112,8 @@ def test_measurements_of_a_board_are_published_with_their_stamps(ros: Ros, link:
         connected = ros.diagnosis(
             "driver", lambda s: s.message.startswith("connected") and bool(diagnostic_value(s, LOST))
         )
+        with link.open("rb", buffering=0) as port:
+            assert termios.tcgetattr(port)[4] == termios.B921600
         device.resume()
         ros.spin_until(lambda: len(received) >= 100)
         published = [(m.sequence, np.float32(m.range)) for _, m in received]

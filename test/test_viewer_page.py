@@ -407,7 +407,7 @@ def test_names_on_the_map_do_not_cover_each_other(browser: Browser, view: View, 
 
 
 def test_selected_pair_survives_a_restart(browser: Browser, view: View) -> None:
-    with ViewerServer(view, port=0) as server:
+    with ViewerServer(view, port=0, token="s3cret/+") as server:
         browser.open(server.url + "#anchor=3&tag=7")
         title = "Range, last 60 s: anchor 3, tag 7"
         browser.wait("the requested pair", lambda: browser.find("heading", title))
@@ -416,7 +416,13 @@ def test_selected_pair_survives_a_restart(browser: Browser, view: View) -> None:
     browser.wait("the loss of the viewer", lambda: "Connection lost" in browser.text())
     assert "Position " not in browser.text().partition("Anchors")[0], "no old verdict"
     add_range(view, 5.2, 3)
-    with ViewerServer(view, port=server.port):
+    # Without the cookie, the request of the waiting page has the token. A viewer that hangs does not answer it.
+    browser.driver.delete_all_cookies()
+    with socket.create_server(("127.0.0.1", server.port)) as hanging:
+        request, _ = hanging.accept()
+        assert request.recv(4) == b"HEAD"
+    with request, ViewerServer(again := View(view.scene), port=server.port, token="s3cret/+"):
         browser.wait("the page to come back", lambda: not browser.run("return window.before ?? false"))
+        assert again.pages == 1, "waiting makes no session"
         browser.wait("its range", lambda: len(browser.column("strip", "raw")) == 1)
         assert "anchor=3" in browser.driver.current_url

@@ -7,8 +7,10 @@ from pathlib import Path
 
 from benchmarks import firmware
 from benchmarks.equipment import emulator
+from benchmarks.equipment.random_networks import rounding_windows
 from benchmarks.paper import published
 from uwb_mitigation.mitigation.embedded.compiling import run_tool
+from uwb_mitigation.mitigation.embedded.export import Golden, golden_windows, write_header
 from uwb_mitigation.mitigation.embedded.toolchain import Kernels, Target, compile_image
 
 KINDS = {
@@ -27,12 +29,12 @@ def main() -> None:
     for network in firmware.random_shapes(
         [k for kind, k in published.MODELS if kind == "remnet"], [3], False
     ):
-        windows = firmware.rounding_windows(network.packed.samples, network.packed.input_scale, 200)
-        examples = firmware.golden_windows(network.packed)
+        windows = rounding_windows(network.packed.samples, network.packed.input_scale, 200)
+        examples = golden_windows(network.packed)
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
-            golden = firmware.Golden(examples, network.expect(examples))
-            firmware.write_header(folder, network.packed, network.card, network.model_id, golden)
+            golden = Golden(examples, network.expect(examples))
+            write_header(folder, network.packed, network.card, network.model_id, golden)
             image = compile_image(folder, folder, Target.QEMU_MPS2, Kernels.CORTEX_M4)
             executed = emulator.count_executed(image, windows[100])
             listing = run_tool(["arm-none-eabi-objdump", "-d", "-w", str(image.elf)])

@@ -14,6 +14,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import rclpy
 from rclpy.node import Node
@@ -52,14 +53,8 @@ COMMANDS = {
     "mitigator": ["mitigator"],
     "plain subscription": [sys.executable, "-c", BARE],
     "driver": [
-        "driver",
-        "--ros-args",
-        "-p",
-        "source:=mcap",
-        "-p",
+        *["driver", "--ros-args", "-p", "source:=mcap", "-p", "wait_for_subscribers:=3", "-p"],
         f"path:={bag}",
-        "-p",
-        "wait_for_subscribers:=3",
     ],
     "plain publisher": [sys.executable, "-c", BARE_PUBLISHER],
 }
@@ -67,7 +62,7 @@ rclpy.init()
 client, received = Node("client"), {"raw": 0, "corrected": 0}
 
 
-def count(name):
+def count(name: str) -> None:
     received[name] += 1
 
 
@@ -75,17 +70,17 @@ client.create_subscription(RangeCir, "/uwb/range_raw", lambda _: count("raw"), 1
 client.create_subscription(RangeCorrected, "/uwb/range_corrected", lambda _: count("corrected"), 1000)
 
 
-def start(name):
+def start(name: str) -> subprocess.Popen[str]:
     return subprocess.Popen(COMMANDS[name], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 
-def wait_for(name):
+def wait_for(name: str) -> None:
     received[name] = 0
     while not received[name]:
         rclpy.spin_once(client, timeout_sec=0.01)
 
 
-def come_back(name):
+def come_back(name: str) -> tuple[float, float]:
     """Kill and restart a node; return the times until it is ready and until its first range, s."""
     running[name].kill()
     running[name].wait()
@@ -94,10 +89,11 @@ def come_back(name):
         rclpy.spin_once(client, timeout_sec=0.01)
     began_s = time.monotonic()
     running[name] = start(name)
-    running[name].stdout.readline()  # model loaded, subscription created, recording open
+    output: Any = running[name].stdout
+    output.readline()  # model loaded, subscription created, recording open
     ready_s = time.monotonic() - began_s
     if name.startswith("plain"):
-        running[name].stdout.readline()
+        output.readline()
     else:
         wait_for("corrected" if name == "mitigator" else "raw")
     return ready_s, time.monotonic() - began_s
@@ -106,7 +102,7 @@ def come_back(name):
 running = {name: start(name) for name in COMMANDS}
 try:
     wait_for("corrected")
-    measured = {name: [] for name in COMMANDS}
+    measured: dict[str, list[tuple[float, float]]] = {name: [] for name in COMMANDS}
     for _ in range(times):
         for name in COMMANDS:
             measured[name].append(come_back(name))

@@ -14,6 +14,7 @@ import threading
 import time
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import psutil
@@ -116,7 +117,7 @@ def seek() -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "long.mcap")
         write_long(path)
-        player = BagPlayer(path, lambda: None)
+        player = BagPlayer(path, Mock())
         player.index(EstimatorConfig(HALL)).join()
         page, used_s = Drawn(View(player.scene, player=player)), []
         for position_s in np.random.default_rng(1).uniform(0.0, player.seconds, 1 + SEEKS):
