@@ -13,6 +13,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Iterable, Sequence
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,6 +92,7 @@ class RobustUpdate:
         error_unit: decays with the persisting errors, m.
         moments: float64 (n + 1, n), P and below it x, which are views of it: many operations are the same for both.
         H: float64 (n,), derivatives of the next range with respect to the motion states, which the owner sets.
+        x_items, P_items, H_items: the same as memory views, whose elements are Python numbers: faster than those of arrays.
         estimates_errors: whether measurements change offset and errors, which are only considered otherwise.
         consistency: running mean of the second moments of the persisting errors, relative to the model; 1: they are as modelled.
         raw_factor: of the variance of raw ranges; the owner sets it.
@@ -124,8 +126,13 @@ class RobustUpdate:
         self._flat, self._size = moments.reshape(-1), moments.shape[1]
         self.P: NDArray[np.float64] = moments[:-1]
         self.x: NDArray[np.float64] = moments[-1]
-        self.H = np.zeros(len(self.x))
+        self.H = np.zeros(self._size)
         self.H[self._offset] = 1.0
+        arrays = self.x.data, self.P.data, self.H.data
+        self.x_items, self.P_items, self.H_items = cast("tuple[memoryview[float], ...]", arrays)
+        # Views, and memory for products, are made once.
+        self.motion_P, self._product = self.P[: self._offset, : self._offset], np.zeros(self._size + 1)
+        self._PH, self._transposed = self._product[:-1], moments.T
         # States of errors whose derivatives are not 0.
         self._used: tuple[int, ...] = ()
 
@@ -175,13 +182,17 @@ class RobustUpdate:
         if self.error_unit < MIN_UNIT:
             self.normalise()
 
-    def add_states(self, terms: Iterable[tuple[int, float, int]]) -> None:
-        """Add to a state another one multiplied by a factor, in the covariance, too: (added to, factor, added) in this order."""
+    def add_states(self, terms: Iterable[tuple[int, float, int]], count: int = 1) -> None:
+        """Add to a state another one multiplied by a factor, in the covariance, too: (added to, factor, added) in this order.
+
+        With a `count`, the same for that number of states behind both.
+        """
         flat, n = self._flat, self._size
         for target, factor, source in terms:
-            # Row and column: products of small matrices take several times as long.
-            daxpy(flat, flat, n, factor, source * n, 1, target * n, 1)
-            daxpy(flat, flat, n + 1, factor, source, n, target, n)
+            # Rows and columns: products of small matrices take several times as long.
+            daxpy(flat, flat, count * n, factor, source * n, 1, target * n, 1)
+            for k in range(count):
+                daxpy(flat, flat, n + 1, factor, source + k, n, target + k, n)
 
     def add_noise(self, row: int, column: int, count: int, variance: float) -> None:
         """Add to that number of elements of the covariance, from a row and a column on along the diagonal."""
@@ -217,11 +228,11 @@ class RobustUpdate:
         """
         constant = self._constant_row(anchor) if is_corrected else 0
         self._is_raw[anchor] = not is_corrected
-        model, x, H, P, k = self._model, self.x, self.H, self.P, self._offset
+        model, x, H, P, k = self._model, self.x_items, self.H_items, self.P_items, self._offset
         row, factor = k + 1 + anchor, 1.0
+        # Conditions are faster here than `min` and `max`.
         if not is_corrected:
             factor = self.raw_factor
-            # A condition is faster here than `max`.
             if self.raw_ratio > LARGE_RATIO * factor:
                 factor = min(self.raw_ratio / LARGE_RATIO, MAX_RATIO)
         variance, error_variance = factor * model.variance(variance_m2), self._error_variance[anchor]
@@ -231,7 +242,9 @@ class RobustUpdate:
         self._noise_until[anchor] = noise_until
         # The part of the variance that the persisting error does not explain is white noise.
         white_share = CORRECTED_WHITE if is_corrected else model.white
-        white = max(white_share * variance, variance - error_variance)
+        white, unexplained = white_share * variance, variance - error_variance
+        if white < unexplained:
+            white = unexplained
         self._error_variance[anchor] = error_variance + 0.1 * (
             (1.0 - white_share) * variance - error_variance
         )
@@ -239,24 +252,24 @@ class RobustUpdate:
             H[used] = 0.0
         self._used = (row, constant) if is_corrected else (row,)
         H[row] = unit
-        residual = range_m - distance_m - x.item(k)
+        residual = range_m - distance_m - x[k]
         if is_corrected and variance > UNCERTAIN_SD**2:
-            range_sd, error_m = math.sqrt(variance), residual - x.item(constant)
+            range_sd, error_m = math.sqrt(variance), residual - x[constant]
             residual -= min(self.overcorrection, 0.0) * range_sd
             if self.estimates_errors:
                 # This mean is not robust: weights that prefer short ranges would find overcorrection behind thick walls, too.
                 self._num_uncertain = min(self._num_uncertain + 1, MAX_UNCERTAIN)
                 error = min(max(error_m / range_sd, -1.0), 3.0)
                 self.overcorrection += (error - self.overcorrection) / self._num_uncertain
-        innovation = residual - unit * x.item(row)
+        innovation = residual - unit * x[row]
         if is_corrected:
             H[constant] = 1.0
-            innovation -= x.item(constant)
+            innovation -= x[constant]
             # Near an anchor the distance is not linear in the position: variance of its second-order term (Bar-Shalom, Li,
             # Kirubarajan, 10.3.2). Otherwise the filter may continue on the other side of an anchor that it passes.
-            curvature = (P.item(0, 0) + P.item(1, 1)) / max(distance_m, SHORTEST_M)
+            curvature = (P[0, 0] + P[1, 1]) / (distance_m if distance_m > SHORTEST_M else SHORTEST_M)
             white += 0.5 * curvature * curvature
-        z, sd = self.update(H, innovation, white)
+        z, sd = self.update(self.H, innovation, white)
         limit = model.long if z > 0.0 else -model.short
         if z / limit > 1.0:
             # The square root of the factor of the variance.
@@ -265,7 +278,9 @@ class RobustUpdate:
         square = residual * self._last_residual[anchor]
         self._last_residual[anchor] = residual
         self.residual_square += RESIDUAL_RATE * (square - self.residual_square)
-        ratio = min((x.item(row) ** 2 + P.item(row, row)) / (noise_until * error_variance), MAX_RATIO)
+        ratio = (x[row] ** 2 + P[row, row]) / (noise_until * error_variance)
+        if ratio > MAX_RATIO:
+            ratio = MAX_RATIO
         self.consistency += CONSISTENCY_RATE * (ratio - self.consistency)
         if not is_corrected:
             self.raw_ratio += RESIDUAL_RATE * (factor * ratio - self.raw_ratio)
@@ -276,8 +291,8 @@ class RobustUpdate:
     ) -> tuple[float, float]:
         """Update with a measurement with Jacobian H (n,) and noise variance R; return as `update_range`."""
         # The method `dot` and BLAS are faster here than operators.
-        product = self.moments.dot(H)
-        PH = product[:-1]
+        product, PH = self._product, self._PH
+        self.moments.dot(H, product)
         S = ddot(H, PH) + (R if R > MIN_VARIANCE_M2 else MIN_VARIANCE_M2)
         sd = math.sqrt(S)
         z, product[-1] = innovation / sd, -innovation
@@ -287,7 +302,7 @@ class RobustUpdate:
             gain[self._offset :] = 0.0
         # This is Joseph's form for these gains: moments -= product gain.T / S, in place.
         factor = -1.0 / (S * self._model.inflation(z) if robust else S)
-        dger(factor, gain, product, 1, 1, self.moments.T, 1, 1, 1)
+        dger(factor, gain, product, 1, 1, self._transposed, 1, 1, 1)
         if not self.estimates_errors:
             # The covariance of errors that are only considered stays.
             self.P[:, self._offset :] = self.P[self._offset :].T
