@@ -94,7 +94,7 @@ class RangeFilter:
             return
         self.time_s = time_s
         axes, state, q = 2 if self.is_level else 3, self.state, self._model.acceleration**2 * dt
-        state.add_states([(0, dt, 3)], axes)
+        state.add_states(0, dt, 3, axes)
         state.add_noise(0, 0, axes, q * dt * dt / 3.0)
         state.add_noise(0, 3, axes, q * dt / 2.0)
         state.add_noise(3, 0, axes, q * dt / 2.0)

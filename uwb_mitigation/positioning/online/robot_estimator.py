@@ -225,7 +225,7 @@ class RobotEstimator:
             filter_ = hypothesis.filter
             filter_.advance(time_s, point)
             if climbing is not None:
-                filter_.set_height(climbing.x.item(2), climbing.P.item(2, 2))
+                filter_.set_height(climbing.x_items[2], climbing.P_items[2, 2])
             filter_.state.raw_factor = tag.raw_factor
             z, sd = filter_.update(*measurement[1:])
             if self._area is not None:
@@ -239,16 +239,16 @@ class RobotEstimator:
             return
         if self._test.is_due(time_s, point):
             state = tag.filter.state
-            variance = 0.5 * (state.P.item(0, 0) + state.P.item(1, 1)) * state.covariance_scale()
-            self._test.add(time_s, complex(*state.x[:2].tolist()), variance, point)
+            variance = 0.5 * (state.P_items[0, 0] + state.P_items[1, 1]) * state.covariance_scale()
+            self._test.add(time_s, complex(*state.x_items[:2]), variance, point)
         if self._heading_filter is not None:
             self._update_separation(self._heading_filter, dt)
 
     def _update_separation(self, heading_filter: OdometryFilter, dt: float) -> None:
         assert self.tag.filter is not None
         state, (x, y, _) = self.tag.filter.state, heading_filter.antenna
-        dx, dy = x - state.x.item(0), y - state.x.item(1)
-        a, b, c = state.P.item(0, 0), state.P.item(0, 1), state.P.item(1, 1)
+        dx, dy, P = x - state.x_items[0], y - state.x_items[1], state.P_items
+        a, b, c = P[0, 0], P[0, 1], P[1, 1]
         separation = (c * dx * dx - 2.0 * b * dx * dy + a * dy * dy) / max(a * c - b * b, 1e-12)
         if dt > 0.0:
             self._separation += min(dt / SEPARATION_S, 1.0) * (separation - self._separation)

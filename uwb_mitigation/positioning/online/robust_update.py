@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import cast
 
 import numpy as np
@@ -131,7 +131,8 @@ class RobustUpdate:
         arrays = self.x.data, self.P.data, self.H.data
         self.x_items, self.P_items, self.H_items = cast("tuple[memoryview[float], ...]", arrays)
         # Views, and memory for products, are made once.
-        self.motion_P, self._product = self.P[: self._offset, : self._offset], np.zeros(self._size + 1)
+        self._rows, self._columns = self.P[: self._offset], self.P[:, : self._offset]
+        self.motion_P, self._product = self._rows[:, : self._offset], np.zeros(self._size + 1)
         self._PH, self._transposed = self._product[:-1], moments.T
         # States of errors whose derivatives are not 0.
         self._used: tuple[int, ...] = ()
@@ -182,17 +183,18 @@ class RobustUpdate:
         if self.error_unit < MIN_UNIT:
             self.normalise()
 
-    def add_states(self, terms: Iterable[tuple[int, float, int]], count: int = 1) -> None:
-        """Add to a state another one multiplied by a factor, in the covariance, too: (added to, factor, added) in this order.
+    def predict_motion(self, F: NDArray[np.float64]) -> None:
+        """Replace the covariance by F P F.T, with the transition matrix F (k, k) of the motion states."""
+        self._rows[:] = F.dot(self._rows)
+        self._columns[:] = self._columns.dot(F.T)
 
-        With a `count`, the same for that number of states behind both.
-        """
+    def add_states(self, target: int, factor: float, source: int, count: int) -> None:
+        """Add to that number of states, from `target` on, those from `source` on multiplied by a factor, in the covariance, too."""
         flat, n = self._flat, self._size
-        for target, factor, source in terms:
-            # Rows and columns: products of small matrices take several times as long.
-            daxpy(flat, flat, count * n, factor, source * n, 1, target * n, 1)
-            for k in range(count):
-                daxpy(flat, flat, n + 1, factor, source + k, n, target + k, n)
+        # Rows and columns: products of small matrices take several times as long.
+        daxpy(flat, flat, count * n, factor, source * n, 1, target * n, 1)
+        for k in range(count):
+            daxpy(flat, flat, n + 1, factor, source + k, n, target + k, n)
 
     def add_noise(self, row: int, column: int, count: int, variance: float) -> None:
         """Add to that number of elements of the covariance, from a row and a column on along the diagonal."""
