@@ -23,6 +23,7 @@ from uwb_mitigation.positioning.online.heading_test import KNOWN_YAW_SD, Heading
 from uwb_mitigation.positioning.online.initialization import IMPLAUSIBLE
 from uwb_mitigation.positioning.online.measurements import TagHeight, TagRange
 from uwb_mitigation.positioning.online.odometry_filter import OdometryFilter
+from uwb_mitigation.positioning.online.robust_update import items_of
 from uwb_mitigation.positioning.online.tag_estimator import TagEstimator, run_estimator
 from uwb_mitigation.types.tracks import Estimate, Heading, Ranges, Track, rows_of
 
@@ -179,19 +180,17 @@ class RobotEstimator:
         excess = 2.0 * (self._separation - EQUAL_SEPARATION)
         weight = math.exp(-self._rejections) / (1.0 + math.exp(min(excess, 50.0)))
         # Python numbers are faster here than NumPy.
-        covariance_at, unseen_at = covariance.item, ranges_only.unseen.item
+        P, unseen = items_of(covariance), items_of(ranges_only.unseen)
         x, y, yaw, xx, xy, yy, x_yaw, y_yaw, yaw_variance = heading_filter.published()
-        x0, y0 = position.item(0), position.item(1)
+        x0, y0, _ = position.tolist()
         dx, dy = x0 - x, y0 - y
         of_mean = weight * (1.0 - CONSTANT_SHARE)
         rest, apart = 1.0 - of_mean, weight * (1.0 - weight)
-        covariance[0, 0] = rest * covariance_at(0, 0) + of_mean * (xx + unseen_at(0, 0)) + apart * dx * dx
-        covariance[0, 1] = covariance[1, 0] = (
-            rest * covariance_at(0, 1) + of_mean * (xy + unseen_at(0, 1)) + apart * dx * dy
-        )
-        covariance[1, 1] = rest * covariance_at(1, 1) + of_mean * (yy + unseen_at(1, 1)) + apart * dy * dy
-        covariance[0, 2] = covariance[2, 0] = (1.0 - weight) * covariance_at(0, 2)
-        covariance[1, 2] = covariance[2, 1] = (1.0 - weight) * covariance_at(1, 2)
+        P[0, 0] = rest * P[0, 0] + of_mean * (xx + unseen[0, 0]) + apart * dx * dx
+        P[0, 1] = P[1, 0] = rest * P[0, 1] + of_mean * (xy + unseen[0, 1]) + apart * dx * dy
+        P[1, 1] = rest * P[1, 1] + of_mean * (yy + unseen[1, 1]) + apart * dy * dy
+        P[0, 2] = P[2, 0] = (1.0 - weight) * P[0, 2]
+        P[1, 2] = P[2, 1] = (1.0 - weight) * P[1, 2]
         covariance *= _SEPARATE
         position[0], position[1] = x0 - weight * dx, y0 - weight * dy
         if self._area is not None:
@@ -203,8 +202,8 @@ class RobotEstimator:
         heading: Heading | None = None
         if self._is_confirmed:
             velocity[0], velocity[1], speed_variance = heading_filter.velocity(self.odometry)
-            covariance[3, 4] = covariance[4, 3] = 0.0
-            covariance[3, 3] = covariance[4, 4] = speed_variance
+            P[3, 4] = P[4, 3] = 0.0
+            P[3, 3] = P[4, 4] = speed_variance
             heading = Heading(yaw, np.array([weight * x_yaw, weight * y_yaw, 0.0, variance]))
         return Estimate(stamp_ns, position, velocity, covariance, heading)
 
