@@ -93,13 +93,9 @@ class RangeFilter:
         if dt <= 0.0:
             return
         self.time_s = time_s
-        axes, state, q = 2 if self.is_level else 3, self.state, self._model.acceleration**2 * dt
-        state.add_states(0, dt, 3, axes)
-        state.add_noise(0, 0, axes, q * dt * dt / 3.0)
-        state.add_noise(0, 3, axes, q * dt / 2.0)
-        state.add_noise(3, 0, axes, q * dt / 2.0)
-        state.add_noise(3, 3, axes, q)
-        state.predict_errors(dt / self._model.persistence_s)
+        state, model = self.state, self._model
+        state.predict_velocity(dt, 2 if self.is_level else 3, model.acceleration**2)
+        state.predict_errors(dt / model.persistence_s)
 
     def update(
         self, anchor: int, range_m: float, variance_m2: float, is_corrected: bool

@@ -12,6 +12,7 @@ import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -98,7 +99,7 @@ class RobotEstimator:
         self._is_rejected, self._is_confirmed, self._is_apart = False, False, False
         self._rejections, self._separation = 0.0, 0.0
         self._test = HeadingTest(self._robot.lever_arm, is_verified=self._robot.is_verified)
-        self._recorded = deque(sorted(self._recorded_motion(), key=lambda message: message[0]))
+        self._recorded = deque(sorted(self._recorded_motion(), key=itemgetter(0)))
 
     @property
     def rejects_odometry(self) -> bool:
@@ -161,11 +162,13 @@ class RobotEstimator:
         recorded: list[tuple[int, Callable[..., None], Any]] = []
         if (imu := self._robot.imu) is not None:
             rows = rows_of(imu.stamp_ns, imu.yaw_rate, imu.yaw_rate_variance)
-            recorded += [(row[0], self.odometry.add_imu, row) for row in rows]
+            add_imu = self.odometry.add_imu
+            recorded += [(row[0], add_imu, row) for row in rows]
         if (motion := self._robot.odometry) is not None:
             variance = np.diagonal(motion.twist_covariance, axis1=1, axis2=2)
             rows = rows_of(motion.stamp_ns, motion.pose, motion.twist, variance)
-            recorded += [(row[0], self.odometry.add, row) for row in rows]
+            add = self.odometry.add
+            recorded += [(row[0], add, row) for row in rows]
         return recorded
 
     def _estimate(

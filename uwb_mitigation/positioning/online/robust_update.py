@@ -192,17 +192,19 @@ class RobustUpdate:
         self._rows[:] = F.dot(self._rows)
         self._columns[:] = self._columns.dot(F.T)
 
-    def add_states(self, target: int, factor: float, source: int, count: int) -> None:
-        """Add to that number of states, from `target` on, those from `source` on multiplied by a factor, in the covariance, too."""
+    def predict_velocity(self, dt: float, axes: int, q: float) -> None:
+        """Predict position (0-2) and velocity (3-5) in the first `axes`, with white acceleration of spectral density q."""
         flat, n = self._flat, self._size
-        # Rows and columns: products of small matrices take several times as long.
-        daxpy(flat, flat, count * n, factor, source * n, 1, target * n, 1)
-        for k in range(count):
-            daxpy(flat, flat, n + 1, factor, source + k, n, target + k, n)
-
-    def add_noise(self, row: int, column: int, count: int, variance: float) -> None:
-        """Add to that number of elements of the covariance, from a row and a column on along the diagonal."""
-        daxpy(_ONES, self._flat, count, variance, 0, 1, row * self._size + column, self._size + 1)
+        # Rows and columns of the position plus dt times those of the velocity: products of small matrices take several times as long.
+        daxpy(flat, flat, axes * n, dt, 3 * n, 1, 0, 1)
+        for axis in range(axes):
+            daxpy(flat, flat, n + 1, dt, axis + 3, n, axis, n)
+        # Q along the diagonals of the blocks.
+        q *= dt
+        daxpy(_ONES, flat, axes, q * dt * dt / 3.0, 0, 1, 0, n + 1)
+        daxpy(_ONES, flat, axes, q * dt / 2.0, 0, 1, 3, n + 1)
+        daxpy(_ONES, flat, axes, q * dt / 2.0, 0, 1, 3 * n, n + 1)
+        daxpy(_ONES, flat, axes, q, 0, 1, 3 * n + 3, n + 1)
 
     def normalise(self) -> None:
         """Convert the persisting errors in `x` and `P` to metres, with their noise."""
