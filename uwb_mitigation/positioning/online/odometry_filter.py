@@ -151,7 +151,7 @@ class OdometryFilter:
 
     def velocity(self, odometry: DeadReckoning) -> tuple[float, float, float]:
         """Return the velocity of the antenna (m/s) and its variance in each axis (m^2/s^2), with the latest twist of the odometry."""
-        (x, y, yaw_rate), yaw = odometry.twist or (0.0, 0.0, 0.0), self.state.x_items[YAW]
+        (x, y, yaw_rate), yaw = odometry.twist or (0.0, 0.0, 0.0), self.state.x.item(YAW)
         (vx, vy), (arm_x, arm_y) = _rotated(x, y, yaw), self._arm(yaw)
         variance = odometry.twist_variance[0] + self.yaw_variance * (x * x + y * y)
         return vx - yaw_rate * arm_y, vy + yaw_rate * arm_x, variance

@@ -205,8 +205,8 @@ class RobotEstimator:
         heading: Heading | None = None
         if self._is_confirmed:
             velocity[0], velocity[1], speed_variance = heading_filter.velocity(self.odometry)
-            P[3, 4] = P[4, 3] = 0.0
-            P[3, 3] = P[4, 4] = speed_variance
+            covariance[3, 4] = covariance[4, 3] = 0.0
+            covariance[3, 3] = covariance[4, 4] = speed_variance
             heading = Heading(yaw, np.array([weight * x_yaw, weight * y_yaw, 0.0, variance]))
         return Estimate(stamp_ns, position, velocity, covariance, heading)
 
