@@ -84,9 +84,7 @@ class NoiseModel:
 
     def variance(self, published_m2: float) -> float:
         """Return the variance of a range: the published one, or the default if that is unknown."""
-        if math.isfinite(published_m2) and published_m2 > 0.0:
-            return published_m2
-        return self.range_sd**2
+        return published_m2 if 0.0 < published_m2 < math.inf else self.range_sd**2
 
     def variances(self, published_m2: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return `variance` of each range, float64 (n,)."""

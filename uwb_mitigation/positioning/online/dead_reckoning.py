@@ -137,8 +137,9 @@ class DeadReckoning:
             vx, vy, yaw_rate = _twist_of_poses(last_pose, pose, dt, twist)
             speed = math.hypot(vx, vy)
         of_x, of_y, of_yaw_rate = twist_variance
-        of_speed = _known_variance(of_x if of_x > of_y else of_y, SPEED_SD)
-        of_yaw_rate = _known_variance(of_yaw_rate, YAW_RATE_SD)
+        of_speed = of_x if of_x > of_y else of_y
+        of_speed = of_speed if 0.0 < of_speed < _MAX_VARIANCE else SPEED_SD**2
+        of_yaw_rate = of_yaw_rate if 0.0 < of_yaw_rate < _MAX_VARIANCE else YAW_RATE_SD**2
         drift, turn_sd = WHEEL_DRIFT * speed, WHEEL_TURN
         yaw_density = of_yaw_rate * dt + _TURN_NOISE * yaw_rate * yaw_rate
         source = before.source + before.source % 2
@@ -177,7 +178,8 @@ class DeadReckoning:
             if not 0 < gap_ns <= ODOMETRY_TIMEOUT_S * NS_PER_S:
                 # The rotation in a gap is unknown, also after a wrong stamp.
                 self._imu_yaw = None
-        self._imu = stamp_ns, yaw_rate, _known_variance(variance, YAW_RATE_SD), turned, yaw
+        variance = variance if 0.0 < variance < _MAX_VARIANCE else YAW_RATE_SD**2
+        self._imu = stamp_ns, yaw_rate, variance, turned, yaw
 
     def point_at(self, stamp_ns: int) -> PathPoint | None:
         """Return the path at a time, by interpolation, or by extrapolation of the latest motion; None: unknown."""
@@ -219,10 +221,6 @@ def _yaw_of_imu(stamp_ns: int, imu: tuple[int, float, float, float, float]) -> f
     at_ns, rate, _, yaw, _ = imu
     dt = (stamp_ns - at_ns) / NS_PER_S
     return yaw + rate * dt if abs(dt) <= IMU_TIMEOUT_S else None
-
-
-def _known_variance(variance: float, default_sd: float) -> float:
-    return variance if 0.0 < variance < _MAX_VARIANCE else default_sd**2
 
 
 def _twist_of_poses(

@@ -49,7 +49,7 @@ class OdometryFilter:
         state: mean, covariance and updates.
     """
 
-    __slots__ = ("_anchors", "_lever_arm", "_model", "point", "state", "time_s")
+    __slots__ = ("_F", "_anchors", "_lever_arm", "_model", "point", "state", "time_s")
 
     def __init__(
         self,
@@ -61,7 +61,7 @@ class OdometryFilter:
         yaw: tuple[float, float],
     ) -> None:
         self._anchors: list[list[float]] = anchors.position.tolist()
-        self._model = model
+        self._model, self._F = model, np.eye(MOTION)
         self.time_s, self.point, self._lever_arm = start.time_s, point, lever_arm
         motion = np.zeros(MOTION)
         motion[:3], motion[YAW] = start.position, yaw[0]
@@ -87,31 +87,35 @@ class OdometryFilter:
         if dt <= 0.0:
             return
         self.time_s, self.point = time_s, point
-        x, P = self.state.x, self.state.P
+        state, F = self.state, self._F
+        x, P = state.x_items, state.P_items
         _, dx, dy, turned, distance, drift, turn, of_position, of_yaw, source = map(sub, point, before)
         if source:
             # The errors of wheels say nothing about those of an IMU.
             for index in (DRIFT, TURN):
-                x[index] = P[index] = P[:, index] = 0.0
+                x[index] = state.P[index] = state.P[:, index] = 0.0
                 P[index, index] = 1.0
-        east, north, _, yaw, scale, yaw_drift, yaw_turn = x[:MOTION].tolist()
+        east, north, _, yaw, scale, yaw_drift, yaw_turn = x[:MOTION]
         dx, dy = _rotated(dx, dy, yaw - before.yaw)
         scale += 1.0
         if distance or drift or turn:
             # The position depends on the yaw before.
-            of_base = (0, -scale * dy, YAW), (0, dx, SCALE), (1, scale * dx, YAW), (1, dy, SCALE)
-            self.state.add_states((*of_base, (YAW, drift, DRIFT), (YAW, turn, TURN)))
+            F[0, YAW], F[0, SCALE] = -scale * dy, dx
+            F[1, YAW], F[1, SCALE] = scale * dx, dy
+            F[YAW, DRIFT], F[YAW, TURN] = drift, turn
+            state.predict_motion(F)
         x[0], x[1] = east + scale * dx, north + scale * dy
         x[YAW] = yaw + turned + drift * yaw_drift + turn * yaw_turn
         # Sums are smaller than before if they were extrapolated.
         if of_position > 0.0:
-            self.state.add_noise(0, 0, 2, of_position)
+            P[0, 0] += of_position
+            P[1, 1] += of_position
         if of_yaw > 0.0:
             P[YAW, YAW] += of_yaw
         elapsed = dt / STATIONARY_S
         if distance > 0.0:
             elapsed += distance / (self._model.persistence_s * WALKING_SPEED)
-        self.state.predict_errors(elapsed)
+        state.predict_errors(elapsed)
 
     def update(
         self, anchor: int, range_m: float, variance_m2: float, is_corrected: bool
@@ -119,11 +123,11 @@ class OdometryFilter:
         """Update with a finite range at the time of the state; see `RobustUpdate.update_range`."""
         # Python numbers are faster here than NumPy.
         state, (u, v, w) = self.state, self._anchors[anchor]
-        x, y, z, yaw = state.x[:SCALE].tolist()
+        x, y, z, yaw = state.x_items[:SCALE]
         arm_x, arm_y = self._arm(yaw)
         x, y, z = x + arm_x - u, y + arm_y - v, z + self._lever_arm[2] - w
         distance = math.sqrt(x * x + y * y + z * z)
-        divisor, H = distance if distance > SHORTEST_M else SHORTEST_M, state.H
+        divisor, H = distance if distance > SHORTEST_M else SHORTEST_M, state.H_items
         H[0], H[1], H[2] = x / divisor, y / divisor, z / divisor
         H[YAW] = (y * arm_x - x * arm_y) / divisor
         return state.update_range(anchor, range_m, distance, variance_m2, is_corrected)
@@ -157,8 +161,8 @@ class OdometryFilter:
 
     def published(self) -> tuple[float, ...]:
         """Return x and y of the antenna and the yaw, and their covariance: xx, xy, yy, x yaw, y yaw, yaw yaw (m, rad)."""
-        x, y, _, yaw = self.state.x[:SCALE].tolist()
-        (xx, xy, _, x_yaw), (_, yy, _, y_yaw), _, (_, _, _, yaw_yaw) = self.state.P[:SCALE, :SCALE].tolist()
+        (x, y, _, yaw), P = self.state.x_items[:SCALE], self.state.P_items
+        xx, xy, yy, x_yaw, y_yaw, yaw_yaw = P[0, 0], P[0, 1], P[1, 1], P[0, YAW], P[1, YAW], P[YAW, YAW]
         arm_x, arm_y = self._arm(yaw)
         # Only the position: the heading depends on the odometry more than on errors of ranges.
         scale = COVARIANCE_SCALE
@@ -178,19 +182,19 @@ class OdometryFilter:
     @property
     def antenna(self) -> tuple[float, float, float]:
         """Position of the antenna, m."""
-        x, y, z, yaw = self.state.x[:SCALE].tolist()
+        x, y, z, yaw = self.state.x_items[:SCALE]
         arm_x, arm_y = self._arm(yaw)
         return x + arm_x, y + arm_y, z + self._lever_arm[2]
 
     @property
     def yaw(self) -> float:
         """Yaw of the base, rad."""
-        return self.state.x.item(YAW)
+        return self.state.x_items[YAW]
 
     @property
     def yaw_variance(self) -> float:
         """Variance of the yaw, rad^2."""
-        return self.state.P.item(YAW, YAW)
+        return self.state.P_items[YAW, YAW]
 
     def _arm(self, yaw: float) -> tuple[float, float]:
         """Return the horizontal lever arm in the axes of the map."""

@@ -12,6 +12,7 @@ import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from uwb_mitigation.positioning.online.heading_test import KNOWN_YAW_SD, Heading
 from uwb_mitigation.positioning.online.initialization import IMPLAUSIBLE
 from uwb_mitigation.positioning.online.measurements import TagHeight, TagRange
 from uwb_mitigation.positioning.online.odometry_filter import OdometryFilter
-from uwb_mitigation.positioning.online.robust_update import COVARIANCE_SCALE
+from uwb_mitigation.positioning.online.robust_update import COVARIANCE_SCALE, items_of
 from uwb_mitigation.positioning.online.tag_estimator import TagEstimator, run_estimator
 from uwb_mitigation.types.tracks import Estimate, Heading, Ranges, Track, rows_of
 
@@ -98,7 +99,7 @@ class RobotEstimator:
         self._is_rejected, self._is_confirmed, self._is_apart = False, False, False
         self._rejections, self._separation, self._latest_separation = 0.0, 0.0, 0.0
         self._test = HeadingTest(self._robot.lever_arm, is_verified=self._robot.is_verified)
-        self._recorded = deque(sorted(self._recorded_motion(), key=lambda message: message[0]))
+        self._recorded = deque(sorted(self._recorded_motion(), key=itemgetter(0)))
 
     @property
     def rejects_odometry(self) -> bool:
@@ -161,11 +162,13 @@ class RobotEstimator:
         recorded: list[tuple[int, Callable[..., None], Any]] = []
         if (imu := self._robot.imu) is not None:
             rows = rows_of(imu.stamp_ns, imu.yaw_rate, imu.yaw_rate_variance)
-            recorded += [(row[0], self.odometry.add_imu, row) for row in rows]
+            add_imu = self.odometry.add_imu
+            recorded += [(row[0], add_imu, row) for row in rows]
         if (motion := self._robot.odometry) is not None:
             variance = np.diagonal(motion.twist_covariance, axis1=1, axis2=2)
             rows = rows_of(motion.stamp_ns, motion.pose, motion.twist, variance)
-            recorded += [(row[0], self.odometry.add, row) for row in rows]
+            add = self.odometry.add
+            recorded += [(row[0], add, row) for row in rows]
         return recorded
 
     def _estimate(
@@ -180,19 +183,17 @@ class RobotEstimator:
         excess = 2.0 * (self._separation - EQUAL_SEPARATION)
         weight = math.exp(-self._rejections) / (1.0 + math.exp(min(excess, 50.0)))
         # Python numbers are faster here than NumPy.
-        covariance_at, unseen_at = covariance.item, ranges_only.unseen.item
+        P, unseen = items_of(covariance), items_of(ranges_only.unseen)
         x, y, yaw, xx, xy, yy, x_yaw, y_yaw, yaw_variance = heading_filter.published()
-        x0, y0 = position.item(0), position.item(1)
+        x0, y0, _ = position.tolist()
         dx, dy = x0 - x, y0 - y
         of_mean = weight * (1.0 - CONSTANT_SHARE)
         rest, apart = 1.0 - of_mean, weight * (1.0 - weight)
-        covariance[0, 0] = rest * covariance_at(0, 0) + of_mean * (xx + unseen_at(0, 0)) + apart * dx * dx
-        covariance[0, 1] = covariance[1, 0] = (
-            rest * covariance_at(0, 1) + of_mean * (xy + unseen_at(0, 1)) + apart * dx * dy
-        )
-        covariance[1, 1] = rest * covariance_at(1, 1) + of_mean * (yy + unseen_at(1, 1)) + apart * dy * dy
-        covariance[0, 2] = covariance[2, 0] = (1.0 - weight) * covariance_at(0, 2)
-        covariance[1, 2] = covariance[2, 1] = (1.0 - weight) * covariance_at(1, 2)
+        P[0, 0] = rest * P[0, 0] + of_mean * (xx + unseen[0, 0]) + apart * dx * dx
+        P[0, 1] = P[1, 0] = rest * P[0, 1] + of_mean * (xy + unseen[0, 1]) + apart * dx * dy
+        P[1, 1] = rest * P[1, 1] + of_mean * (yy + unseen[1, 1]) + apart * dy * dy
+        P[0, 2] = P[2, 0] = (1.0 - weight) * P[0, 2]
+        P[1, 2] = P[2, 1] = (1.0 - weight) * P[1, 2]
         covariance *= _SEPARATE
         position[0], position[1] = x0 - weight * dx, y0 - weight * dy
         if self._area is not None:
@@ -229,7 +230,7 @@ class RobotEstimator:
             filter_ = hypothesis.filter
             filter_.advance(time_s, point)
             if climbing is not None:
-                filter_.set_height(climbing.x.item(2), climbing.P.item(2, 2))
+                filter_.set_height(climbing.x_items[2], climbing.P_items[2, 2])
             filter_.state.raw_factor = tag.raw_factor
             z, sd = filter_.update(*measurement[1:])
             if self._area is not None:
@@ -243,16 +244,16 @@ class RobotEstimator:
             return
         if self._test.is_due(time_s, point):
             state = tag.filter.state
-            variance = 0.5 * (state.P.item(0, 0) + state.P.item(1, 1)) * COVARIANCE_SCALE
-            self._test.add(time_s, complex(*state.x[:2].tolist()), variance, point)
+            variance = 0.5 * (state.P_items[0, 0] + state.P_items[1, 1]) * COVARIANCE_SCALE
+            self._test.add(time_s, complex(*state.x_items[:2]), variance, point)
         if self._heading_filter is not None:
             self._update_separation(self._heading_filter, dt)
 
     def _update_separation(self, heading_filter: OdometryFilter, dt: float) -> None:
         assert self.tag.filter is not None
         state, (x, y, _) = self.tag.filter.state, heading_filter.antenna
-        dx, dy = x - state.x.item(0), y - state.x.item(1)
-        a, b, c = state.P.item(0, 0), state.P.item(0, 1), state.P.item(1, 1)
+        dx, dy, P = x - state.x_items[0], y - state.x_items[1], state.P_items
+        a, b, c = P[0, 0], P[0, 1], P[1, 1]
         separation = (c * dx * dx - 2.0 * b * dx * dy + a * dy * dy) / max(a * c - b * b, 1e-12)
         self._latest_separation = separation
         if dt > 0.0:

@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,6 +74,11 @@ MIN_UNIT, MAX_ELAPSED = 1e-3, 100.0
 _ONES = np.ones(3)
 
 
+def items_of(array: NDArray[np.float64]) -> memoryview[float]:
+    """Return the elements of an array for reading and writing as Python numbers: faster than with the array."""
+    return cast("memoryview[float]", array.data)
+
+
 class RobustUpdate:
     """Mean, covariance and measurement updates.
 
@@ -87,6 +93,7 @@ class RobustUpdate:
         error_unit: decays with the persisting errors, m.
         moments: float64 (n + 1, n), P and below it x, which are views of it: many operations are the same for both.
         H: float64 (n,), derivatives of the next range with respect to the motion states, which the owner sets.
+        x_items, P_items, H_items: the same as memory views, whose elements are Python numbers: faster than those of arrays.
         estimates_errors: whether measurements change offset and errors, which are only considered otherwise.
         raw_factor: of the variance of raw ranges; the owner sets it.
         raw_ratio: running mean of the second moments of the persisting errors of raw ranges, relative to the model without the factor of
@@ -119,8 +126,13 @@ class RobustUpdate:
         self._flat, self._size = moments.reshape(-1), moments.shape[1]
         self.P: NDArray[np.float64] = moments[:-1]
         self.x: NDArray[np.float64] = moments[-1]
-        self.H = np.zeros(len(self.x))
+        self.H = np.zeros(self._size)
         self.H[self._offset] = 1.0
+        self.x_items, self.P_items, self.H_items = map(items_of, (self.x, self.P, self.H))
+        # Views, and memory for products, are made once.
+        self._rows, self._columns = self.P[: self._offset], self.P[:, : self._offset]
+        self.motion_P, self._product = self._rows[:, : self._offset], np.zeros(self._size + 1)
+        self._PH, self._transposed = self._product[:-1], moments.T
         # States of errors whose derivatives are not 0.
         self._used: tuple[int, ...] = ()
 
@@ -170,17 +182,24 @@ class RobustUpdate:
         if self.error_unit < MIN_UNIT:
             self.normalise()
 
-    def add_states(self, terms: Iterable[tuple[int, float, int]]) -> None:
-        """Add to a state another one multiplied by a factor, in the covariance, too: (added to, factor, added) in this order."""
-        flat, n = self._flat, self._size
-        for target, factor, source in terms:
-            # Row and column: products of small matrices take several times as long.
-            daxpy(flat, flat, n, factor, source * n, 1, target * n, 1)
-            daxpy(flat, flat, n + 1, factor, source, n, target, n)
+    def predict_motion(self, F: NDArray[np.float64]) -> None:
+        """Replace the covariance by F P F.T, with the transition matrix F (k, k) of the motion states."""
+        self._rows[:] = F.dot(self._rows)
+        self._columns[:] = self._columns.dot(F.T)
 
-    def add_noise(self, row: int, column: int, count: int, variance: float) -> None:
-        """Add to that number of elements of the covariance, from a row and a column on along the diagonal."""
-        daxpy(_ONES, self._flat, count, variance, 0, 1, row * self._size + column, self._size + 1)
+    def predict_velocity(self, dt: float, axes: int, q: float) -> None:
+        """Predict position (0-2) and velocity (3-5) in the first `axes`, with white acceleration of spectral density q."""
+        flat, n = self._flat, self._size
+        # Rows and columns of the position plus dt times those of the velocity: products of small matrices take several times as long.
+        daxpy(flat, flat, axes * n, dt, 3 * n, 1, 0, 1)
+        for axis in range(axes):
+            daxpy(flat, flat, n + 1, dt, axis + 3, n, axis, n)
+        # Q along the diagonals of the blocks.
+        q *= dt
+        daxpy(_ONES, flat, axes, q * dt * dt / 3.0, 0, 1, 0, n + 1)
+        daxpy(_ONES, flat, axes, q * dt / 2.0, 0, 1, 3, n + 1)
+        daxpy(_ONES, flat, axes, q * dt / 2.0, 0, 1, 3 * n, n + 1)
+        daxpy(_ONES, flat, axes, q, 0, 1, 3 * n + 3, n + 1)
 
     def normalise(self) -> None:
         """Convert the persisting errors in `x` and `P` to metres, with their noise."""
@@ -212,11 +231,11 @@ class RobustUpdate:
         """
         constant = self._constant_row(anchor) if is_corrected else 0
         self._is_raw[anchor] = not is_corrected
-        model, x, H, P, k = self._model, self.x, self.H, self.P, self._offset
+        model, x, H, P, k = self._model, self.x_items, self.H_items, self.P_items, self._offset
         row, factor = k + 1 + anchor, 1.0
+        # Conditions are faster here than `min` and `max`.
         if not is_corrected:
             factor = self.raw_factor
-            # A condition is faster here than `max`.
             if self.raw_ratio > LARGE_RATIO * factor:
                 factor = min(self.raw_ratio / LARGE_RATIO, MAX_RATIO)
         variance, error_variance = factor * model.variance(variance_m2), self._error_variance[anchor]
@@ -226,7 +245,9 @@ class RobustUpdate:
         self._noise_until[anchor] = noise_until
         # The part of the variance that the persisting error does not explain is white noise.
         white_share = CORRECTED_WHITE if is_corrected else model.white
-        white = max(white_share * variance, variance - error_variance)
+        white, unexplained = white_share * variance, variance - error_variance
+        if white < unexplained:
+            white = unexplained
         self._error_variance[anchor] = error_variance + 0.1 * (
             (1.0 - white_share) * variance - error_variance
         )
@@ -234,9 +255,9 @@ class RobustUpdate:
             H[used] = 0.0
         self._used = (row, constant) if is_corrected else (row,)
         H[row] = unit
-        residual = range_m - distance_m - x.item(k)
+        residual = range_m - distance_m - x[k]
         if is_corrected and variance > UNCERTAIN_SD**2:
-            range_sd, error_m = math.sqrt(variance), residual - x.item(constant)
+            range_sd, error_m = math.sqrt(variance), residual - x[constant]
             residual -= min(self.overcorrection, 0.0) * range_sd
             if self.estimates_errors:
                 # This mean is not robust: weights that prefer short ranges would find overcorrection behind thick walls, too.
@@ -245,19 +266,19 @@ class RobustUpdate:
                 self.overcorrection += (error - self.overcorrection) / self._num_uncertain
         if is_corrected:
             H[constant] = 1.0
-            residual -= x.item(constant)
+            residual -= x[constant]
             # Near an anchor the distance is not linear in the position: variance of its second-order term (Bar-Shalom, Li,
             # Kirubarajan, 10.3.2). Otherwise the filter may continue on the other side of an anchor that it passes.
-            curvature = (P.item(0, 0) + P.item(1, 1)) / max(distance_m, SHORTEST_M)
+            curvature = (P[0, 0] + P[1, 1]) / (distance_m if distance_m > SHORTEST_M else SHORTEST_M)
             white += 0.5 * curvature * curvature
-        z, sd = self.update(H, residual - unit * x.item(row), white)
+        z, sd = self.update(self.H, residual - unit * x[row], white)
         residual = min(max(residual, SHORTEST_RESIDUAL_M), LONGEST_RESIDUAL_M)
         # White noise does not contribute to the mean of this product.
         square = residual * self._last_residual[anchor]
         self._last_residual[anchor] = residual
         self.residual_square += RESIDUAL_RATE * (square - self.residual_square)
         if not is_corrected:
-            ratio = min((x.item(row) ** 2 + P.item(row, row)) / (noise_until * error_variance), MAX_RATIO)
+            ratio = min((x[row] ** 2 + P[row, row]) / (noise_until * error_variance), MAX_RATIO)
             self.raw_ratio += RATIO_RATE * (factor * ratio - self.raw_ratio)
         return z, sd
 
@@ -266,8 +287,8 @@ class RobustUpdate:
     ) -> tuple[float, float]:
         """Update with a measurement with Jacobian H (n,) and noise variance R; return as `update_range`."""
         # The method `dot` and BLAS are faster here than operators.
-        product = self.moments.dot(H)
-        PH = product[:-1]
+        product, PH = self._product, self._PH
+        self.moments.dot(H, product)
         S = ddot(H, PH) + (R if R > MIN_VARIANCE_M2 else MIN_VARIANCE_M2)
         sd = math.sqrt(S)
         z, product[-1] = innovation / sd, -innovation
@@ -277,7 +298,7 @@ class RobustUpdate:
             gain[self._offset :] = 0.0
         # This is Joseph's form for these gains: moments -= product gain.T / S, in place.
         factor = -1.0 / (S * self._model.inflation(z) if robust else S)
-        dger(factor, gain, product, 1, 1, self.moments.T, 1, 1, 1)
+        dger(factor, gain, product, 1, 1, self._transposed, 1, 1, 1)
         if not self.estimates_errors:
             # The covariance of errors that are only considered stays.
             self.P[:, self._offset :] = self.P[self._offset :].T

@@ -286,8 +286,9 @@ class TagEstimator:
         self.counts["too short"] += self._is_short
         # Wrong anchor positions also widen the variance, but must be reported.
         unwidened = z if measurement.is_corrected else z * math.sqrt(filter_.state.raw_factor)
-        short = max(min(unwidened, 0.0), -10.0)
-        state = self._states[measurement.anchor]
+        state, short = self._states[measurement.anchor], 0.0
+        if unwidened < 0.0:
+            short = unwidened if unwidened > -10.0 else -10.0
         state.short_square += 0.02 * (short * short - state.short_square)
         state.outliers += 0.1 * ((abs(unwidened) > OUTLIER) - state.outliers)
         state.short += 0.1 * ((unwidened < -OUTLIER) - state.short)
