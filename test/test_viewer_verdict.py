@@ -89,7 +89,7 @@ def test_anchor_that_reads_long_degrades_the_position_by_its_name():
     scene, _ = driven({2: 0.6})
     state, reason, action, *_ = controls(scene).verdict
     assert (state, reason) == ("degraded", "Anchor door reads 0.60 m long")
-    assert action == "Calibrate, or check its position."
+    assert action == "Check its position, or run `uwb-mitigation calibrate`."
     page = shown(scene)
     assert page.column("map", "label") == ["1 \u2713 selected", "door \u2297 +0.6 m", "3 \u2713", "4 \u2713"]
     assert page.column("map", "health")[1] == health.BAD
@@ -121,7 +121,7 @@ def test_marks_of_anchors_have_the_colours_of_their_states(browser: Browser):
 def test_anchor_to_check_is_named_below_a_good_position():
     state, reason, action, *_ = controls(driven({2: 0.2})[0]).verdict
     assert (state, reason) == ("good", "")
-    assert action == "Anchor door reads 0.20 m long: calibrate, or check its position."
+    assert action == "Anchor door reads 0.20 m long: check its position, or run `uwb-mitigation calibrate`."
 
 
 def test_each_tag_has_a_verdict_and_a_track_of_its_own_colour():

@@ -44,8 +44,8 @@ FAULTS = (
     ("displaced", 0.0, BAD, "{place}. Measure it again, or run `uwb-mitigation survey`."),
     # Without line of sight, ranges may be long although anchor and offset are right.
     ("blocked", LONG_M, CHECK, "reads {size:.2f} m {direction}, with {nlos:.0f} % NLOS: its line of sight is probably blocked. Move it if possible."),
-    ("clear", VERY_LONG_M, BAD, "reads {size:.2f} m {direction}: calibrate, or check its position."),
-    ("clear", LONG_M, CHECK, "reads {size:.2f} m {direction}: calibrate, or check its position."),
+    ("clear", VERY_LONG_M, BAD, "reads {size:.2f} m {direction}: check its position, or run `uwb-mitigation calibrate`."),
+    ("clear", LONG_M, CHECK, "reads {size:.2f} m {direction}: check its position, or run `uwb-mitigation calibrate`."),
     ("lost", MAX_LOST, CHECK, "loses {lost:.0f} % of its ranges: check distance and antenna."),
     ("not_ok", MAX_NOT_OK, CHECK, "has {not_ok:.0f} % of ranges with a status that needs attention: see the pairs."),
     ("nlos", MAX_NLOS, CHECK, "has no line of sight in {nlos:.0f} % of the CIRs: move it if possible."),

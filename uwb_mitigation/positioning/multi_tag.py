@@ -299,7 +299,11 @@ class MultiTagEstimator:
                 f"{name} innovation square": f"{estimator.innovation_square:.2f}",
             }
             if range_filter is not None:
-                values[f"{name} overcorrection"] = f"{min(range_filter.state.overcorrection, 0.0):.2f}"
+                values |= {
+                    f"{name} overcorrection": f"{min(range_filter.state.overcorrection, 0.0):.2f}",
+                    f"{name} persisting errors m": f"{math.sqrt(range_filter.state.persisting_variance()):.2f}",
+                    f"{name} variance factor": f"{estimator.raw_factor:.1f}",
+                }
             if tag.robot is not None:
                 values |= {
                     f"{name} heading": tag.robot.heading,

@@ -199,10 +199,8 @@ function start(doc) {
 
   // A session ends with the viewer: the page reloads when the viewer is back.
   doc.on_event("connection_lost", () => {
-    $("lost").style.display = "block";
     // What the page shows may be wrong by now.
-    $("verdict").style.display = $("intervals").style.display = "none";
-    $("age").hidden = true;
+    document.body.classList.add("disconnected");
     // The script, because the server makes a session for each request of the page; one request at a time, with the token.
     const script = new URL(document.querySelector("script[src*='bokeh.min.js']").src);
     script.search += location.search.replace("?", "&");
