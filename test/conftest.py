@@ -50,7 +50,7 @@ LONGEST = (
     "site_page viewer_page calibrate_command tutorial tracking viewer_node viewer_verdict self_calibration "
     "locator_odometry px4 viewer_recordings robot_localization demos positioning robot_estimator firmware_parity "
     "firmware_emulator robots_under_load field_report locator viewer_playback frames topic_source nodes reliability "
-    "public_api model_choice process"
+    "experiments public_api model_choice process"
 )
 """Files that start first, so that none of them runs alone at the end."""
 

@@ -210,6 +210,8 @@ def test_without_cirs_a_drive_past_seven_anchors_with_different_offsets_is_neede
     )
     assert calibration.chosen == chosen
     assert refusal in calibration.refusal
+    if np.ptp(own) == 0.0:
+        assert max(sd_m for _, sd_m in calibration.pairs.values()) < 0.055, "the prior of offsets is small"
 
 
 @pytest.mark.parametrize("truth", [False, True])
