@@ -392,7 +392,6 @@ def test_smoothed_track_has_headings_from_the_start():
 )
 def test_heading_contains_errors(data: Path, layout: str, seed: int, seconds: float, late_s: float):
     run = load_geometry("", "", str(data / "geometries" / GEOMETRIES), layout, 2, seed, seconds)
-    assert run.robot is not None
     late = replace(run.robot.odometry, stamp_ns=run.robot.odometry.stamp_ns + round(late_s * NANOSECONDS))
     track = locate(run, run.ranges, replace(run.robot, odometry=late))
     assert not track_errors(track, run.truth).heading_exceeded > 0.01
