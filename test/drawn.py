@@ -48,7 +48,7 @@ class Drawn:
         self.controls.command = [name, list(arguments), time.monotonic()]
         while self._player is not None and self._player.is_behind:
             self._player.advance()
-        self.controls.acknowledged = self.controls.update[0]
+        self.controls.acknowledged = self.controls.timing[0]
 
     def column(self, model: str, name: str) -> Any:
         """Return a column of the source of a named table, or of the first one of a figure."""

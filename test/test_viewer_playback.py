@@ -98,7 +98,7 @@ def test_seek_shows_data_up_to_the_position(bag: Path):
         }
     assert player.read_cir((2, 7)) is None
     assert player.read_cir((1, 7)).samples.tolist() == record(0).measurement.cir.samples.tolist()
-    assert scene.errors == COUNT, "the truth is joined, and nothing is counted twice"
+    assert player.timeline.errors == COUNT, "the truth is joined, and nothing is counted twice"
 
 
 def test_anchors_of_a_file_replace_those_of_the_bag(bag: Path, tmp_path: Path):
@@ -148,7 +148,7 @@ def test_raw_ranges_are_corrected_for_display_as_in_a_processed_bag(tmp_path: Pa
         player, scene = open_bag(path)
         assert player.corrects == (path == raw)
         player.seek(player.seconds)
-        assert scene.errors == 150
+        assert player.timeline.errors == 150
         assert scene.pairs[1, 7].columns.true_m.tolist() == [4.0 + n for n in range(0, 150, 2)]
         expected = Mitigation(load_bundle(default_model_path())).correct([record(149).measurement])[0].range_m
         assert latest(scene)[2, 7] == pytest.approx(expected)
@@ -273,9 +273,9 @@ def test_several_namespaces_need_a_choice(tmp_path: Path):
                 out.write_message(f"/{board}/uwb/range_raw", topics.RANGE_CIR_TYPE, data, START_NS + number)
     with pytest.raises(UwbMitigationError, match="--namespace with one of: '/left', '/right'"):
         open_bag(path)
-    player, scene = open_bag(path, namespace="/left")
+    player, _ = open_bag(path, namespace="/left")
     player.seek(1.0)
-    assert scene.ranges == 4
+    assert player.timeline.ranges == 4
 
 
 def test_index_of_a_drive_has_tracks_errors_and_residuals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -42,10 +42,10 @@ def test_update_waits_until_the_page_has_drawn_the_last_one(view: View) -> None:
     drawn = Drawn(view)
     view.scene.add_sample((1, 7), Sample(1000.0, 5.3, 5.1, 0.1, Status.OK))
     drawn.page.tick()
-    assert drawn.controls.update[0] == 1
+    assert drawn.controls.timing[0] == 1
     drawn.controls.acknowledged = 1
     drawn.page.tick()
-    assert drawn.controls.update[0] == 2
+    assert drawn.controls.timing[0] == 2
     assert drawn.column("strip", "corrected") == pytest.approx([5.1])
 
 

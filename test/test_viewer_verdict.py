@@ -475,7 +475,7 @@ def test_badge_has_the_age_by_reception_and_the_verdict_that_by_stamp():
     scene.stamp_clock = lambda: clock.now_s + 909.6
     clock.now_s += 2.1
     page = controls(scene)
-    assert page.update[2:] == pytest.approx([2.1])
+    assert page.timing[2:] == pytest.approx([2.1])
     assert "last range 11.7 s old by stamp" in page.verdict[3]
 
 

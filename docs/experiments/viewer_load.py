@@ -52,7 +52,7 @@ LONG, LONG_HZ, SEEKS = 600_000, 100.0, 15
 """Numbers of ranges of the long recording and of seeks."""
 SHARES = 0.9, *((0.1 / (len(Status) - 1),) * (len(Status) - 1))
 """Of the statuses, the first of which is OK."""
-UPDATES = "return Bokeh.documents[0].get_model_by_name('controls').update[0]"
+UPDATES = "return Bokeh.documents[0].get_model_by_name('controls').timing[0]"
 SCREENSHOT = Path("build") / "screens" / "viewer_30_anchors.png"
 
 

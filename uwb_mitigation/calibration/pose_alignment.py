@@ -106,16 +106,14 @@ class PoseAlignment:
             )
 
     def as_json(self) -> dict[str, object]:
-        """Return values for JSON; null = not observable. Lever arm of the first tag, and of all tags by their ids."""
-        arms = self.lever_arm_m.tolist()
-        sds = [[None if math.isnan(sd) else sd for sd in arm_sd] for arm_sd in self.lever_arm_sd_m.tolist()]
+        """Return values for JSON; NaN = not observable. Lever arm of the first tag, and of all tags by their ids."""
         return {
             "time_offset_s": self.time_offset_s,
             "time_offset_sd_s": self.time_offset_sd_s,
-            "lever_arm_m": arms[0],
-            "lever_arm_sd_m": sds[0],
-            "lever_arms_m": arms,
-            "lever_arms_sd_m": sds,
+            "lever_arm_m": self.lever_arm_m[0],
+            "lever_arm_sd_m": self.lever_arm_sd_m[0],
+            "lever_arms_m": self.lever_arm_m,
+            "lever_arms_sd_m": self.lever_arm_sd_m,
         }
 
 

@@ -93,7 +93,7 @@ class Mitigator(ManagedNode):
 
     def __init__(self, *, subscribe: bool = True) -> None:
         super().__init__("mitigator")
-        self.health = MitigatorHealth(self._publisher_count)
+        self.health = MitigatorHealth(lambda: self._raw.get_publisher_count() if self._raw else 0)
         self._subscribe = subscribe
         self._raw: Subscription | None = None
         self._corrected: Publisher | None = None
@@ -208,9 +208,6 @@ class Mitigator(ManagedNode):
             self.get_logger().warning(f"every range is rejected: {advice}")
         self._advised = advice
         return advice
-
-    def _publisher_count(self) -> int:
-        return self._raw.get_publisher_count() if self._raw is not None else 0
 
     def _on_raw(self, messages: Iterator[tuple[bytes, int]]) -> None:
         # Subscriptions stay active while a lifecycle node is inactive.

@@ -107,10 +107,9 @@ class Viewer(ManagedNode):
         self.get_logger().info(f"the page is at {self._server.url}")
 
     def end(self) -> None:
-        server, self._server = self._server, None
-        if server is not None:
-            server.close()
-        self._view = None
+        if self._server is not None:
+            self._server.close()
+        self._server = self._view = None
 
     def close(self) -> None:
         super().close()

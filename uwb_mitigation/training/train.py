@@ -122,7 +122,13 @@ def train_new_model(job: TrainingJob, recipe: Recipe, recipe_name: str = AUTO) -
     """
     check_name("recipe", recipe_name, (AUTO, *models.NEW_MODELS))
     dataset, folds = job.dataset, min(job.folds, len(job.dataset.names))
-    _check_configurations(dataset, selections.min_configurations(job.folds) if recipe_name == AUTO else 2)
+    # No inner fold of `select_nested` may be empty.
+    needed = 2 if recipe_name != AUTO else 4 if job.folds == 2 else 3
+    if (count := len(dataset.names)) < needed:
+        raise DatasetError(
+            f"{count} configuration{'' if count == 1 else 's'}, that is placements of tag and anchor",
+            valid=f"{needed} or more, each under a name of its own in `configuration` of the true ranges",
+        )
     selection, seed = None, recipe.fit.seed
     if not dataset.has_cirs and recipe_name in (models.LINE_NETWORK, models.NETWORK):
         raise DatasetError(
@@ -254,11 +260,3 @@ def site_card(
     return card_of(
         name, network.architecture, dataset, fitted.linear_bias, dataset, residual_m, training, ood_bands
     )
-
-
-def _check_configurations(dataset: Dataset, needed: int) -> None:
-    if (count := len(dataset.names)) < needed:
-        raise DatasetError(
-            f"{count} configuration{'' if count == 1 else 's'}, that is placements of tag and anchor",
-            valid=f"{needed} or more, each under a name of its own in `configuration` of the true ranges",
-        )

@@ -142,18 +142,16 @@ class Track(TimeSeries):
     @classmethod
     def from_estimates(cls, estimates: list[Estimate]) -> Track:
         """Return estimates as a track."""
+        headings = [
+            _UNKNOWN_HEADING if e.heading is None else (e.heading.yaw, *e.heading.covariance.tolist())
+            for e in estimates
+        ]
         return cls(
             np.array([e.stamp_ns for e in estimates], np.int64),
             np.array([e.position for e in estimates], np.float64).reshape(-1, 3),
             np.array([e.velocity for e in estimates], np.float64).reshape(-1, 3),
             np.array([e.covariance for e in estimates], np.float64).reshape(-1, 6, 6),
-            np.array(
-                [
-                    _UNKNOWN_HEADING if e.heading is None else (e.heading.yaw, *e.heading.covariance.tolist())
-                    for e in estimates
-                ],
-                np.float64,
-            ).reshape(-1, 5),
+            np.array(headings, np.float64).reshape(-1, 5),
         )
 
     def __iter__(self) -> Iterator[Estimate]:

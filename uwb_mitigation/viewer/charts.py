@@ -96,6 +96,12 @@ def new_plots(page: PageState, sources: Mapping[str, ColumnDataSource]) -> dict[
     named = [r for r in plots["map"].renderers if isinstance(r.glyph, models.Text)]
     tips = [("", "@name"), ("x, y", "@x{0.00}, @y{0.00} m")]
     plots["map"].add_tools(models.HoverTool(tooltips=tips, renderers=named))
+    # Without buttons: the script of the page calls them for the keys that are their names.
+    for side in ("left", "right", "up", "down"):
+        move = models.ClickPanTool(direction=side, name=f"Arrow{side.title()}", visible=False)
+        plots["map"].add_tools(move)
+    for kind, key, factor in ((models.ZoomInTool, "+", 0.2), (models.ZoomOutTool, "-", 0.25)):
+        plots["map"].add_tools(kind(factor=factor, name=key, visible=False))
     # States have a legend of their own, whose height never changes; a report without ranges has no states.
     marks = [r for r in plots["map"].renderers if r.data_source is sources["states"]]
     items = [models.LegendItem(label=state, renderers=marks, index=row) for row, state in enumerate(LOOKS)]

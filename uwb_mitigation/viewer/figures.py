@@ -65,7 +65,7 @@ class Figures:
         self._draw_cir(scene)
         self._draw_history(scene)
         self._draw_positions(scene)
-        self._draw_errors(scene)
+        self._draw_errors()
 
     def _fill(self, name: str, table: NDArray[np.float64], message: str, source: str = "") -> None:
         """Set the columns of a source (default: of the same name) if they have changed; a message, in place of missing data."""
@@ -77,7 +77,7 @@ class Figures:
         if not all(map(partial(np.array_equal, equal_nan=True), columns, before)):
             source_of.data = dict(zip(source_of.data, columns, strict=True))
         corners.visible = bool(message)
-        self._page.set(empty=self._page.controls.empty | {name: message})
+        self._page.controls.empty = self._page.controls.empty | {name: message}
 
     def _draw_strip(self, scene: Scene) -> None:
         """Draw the ranges of the selected pair in the last minute, and the statuses that need attention."""
@@ -116,7 +116,7 @@ class Figures:
         table, raw = (positions.errors(kind) for kind in (TrackKind.CORRECTED, TrackKind.RAW))
         now_s = table[-1, 0] if is_live and len(table) else 0.0
         message = "" if np.isfinite(table[:, 1:]).any() else "No positions."
-        self.plots["positions"].legend[0].items[0].label = value(scene.track_name)
+        self.plots["positions"].legend[0].items[0].label = value(page.view.timeline.track_name)
         self._fill("positions", thinned(table - (now_s, 0.0, 0.0), NO_DATA_S), message)
         self._fill("positions", thinned(raw[:, :2] - (now_s, 0.0), NO_DATA_S), message, "raw_positions")
 
@@ -143,9 +143,9 @@ class Figures:
         set_rows(self._sources["cir_marks"], marks)
         self._fill("cir", table, message)
 
-    def _draw_errors(self, scene: Scene) -> None:
+    def _draw_errors(self) -> None:
         """Draw histogram and cumulative shares of the errors of the ranges with known truth."""
-        counts = scene.error_counts
+        counts = self._page.view.timeline.error_counts
         shares = 100.0 * np.cumsum(counts, axis=1) / np.maximum(counts.sum(axis=1, keepdims=True), 1)
         table = np.stack([ERROR_EDGES_M[1:], ERROR_EDGES_M[:-1], *counts, *shares], axis=1)
         self._fill("errors", table, "" if counts.any() else "No true ranges.")
@@ -217,7 +217,7 @@ class Figures:
             for name, kind, track in tracks:
                 (colour, *style), label = palette.TRACK_STYLES[kind], kind.value
                 if kind is TrackKind.CORRECTED:
-                    colour, label = colours.get(name, BLUE), scene.track_name
+                    colour, label = colours.get(name, BLUE), self._page.view.timeline.track_name
                 begin_s = track.last.received_s + scene.age_s(track.last) - self._page.trail_s
                 begin = np.searchsorted(track.columns.received_s, begin_s)
                 line = thinned(track.rows[begin:, [-1, 0, 1]], NO_DATA_S)[:, 1:].astype(np.float32)

@@ -31,7 +31,7 @@ def cards(view: View, tag_id: int | None) -> list[Card]:
         return positions.cards(scene.clock() - HISTORY_S, RECENT) + _range_cards(scene, LIVE)
     if not view.timeline.is_read:
         return [["Reading the recording ...", "", ""]]
-    return positions.cards(-math.inf, WHOLE) + _range_cards(scene, WHOLE)
+    return positions.cards(-math.inf, WHOLE) + _range_cards(view.timeline, WHOLE)
 
 
 def _range_cards(scene: Scene, window: str) -> list[Card]:
@@ -65,7 +65,7 @@ class Positions:
         is_ready, all_data = view.timeline.is_complete, view.all_data
         self._tracks = {key: track.columns for key, track in all_data.tracks.items()} if is_ready else {}
         self._names = [name for name, kind in self._tracks if kind is TrackKind.CORRECTED]
-        self._is_corrected = view.scene.corrected > 0
+        self._is_corrected = view.timeline.corrected > 0
         self._name = next(iter(self._names), "")
         if tag_id is not None:
             self._name = tag_name(tag_id, self._names, view.all_data.pairs)

@@ -114,20 +114,20 @@ class Page:
         if is_changed or now_s > self._sent_s + HEARTBEAT_S:
             self._sent, self._sent_s, self._redraw = self._sent + 1, now_s, False
             age_s = scene.clock() - scene.received_s if self._state.has_data else -1.0
-            self._controls.update = [self._sent, round(self._took_s, 3), round(age_s, 3)]
+            self._controls.timing = [self._sent, round(self._took_s, 3), round(age_s, 3)]
 
     def _draw_scene(self, scene: Scene) -> None:
         state = self._state
         if state.selected is None:
             state.selected = next((pair for pair, _, _ in scene.latest()), None)
-        state.set(selected=state.selected and [format_id(identity) for identity in state.selected])
+        self._controls.selected = state.selected and [*map(format_id, state.selected)]
         if (now_s := time.monotonic()) >= self._table_due_s:
             self._table_due_s = now_s + TABLE_S
             self._texts.draw(scene)
         else:
             state.forget("scene")
         self._figures.draw(scene)
-        state.set(available={"accuracy": len(scene.anchors) > 1})
+        self._controls.available = {"accuracy": len(scene.anchors) > 1}
 
     def select(self, pair: Pair | None) -> None:
         """Show the CIR and the ranges of a pair, which may have no ranges yet."""
@@ -137,11 +137,11 @@ class Page:
     def _draw_player(self) -> None:
         player = self._player
         if player is None:
-            self._state.set(player={"playing": not self._paused})
+            self._controls.player = {"playing": not self._paused}
             return
         position_s = round(player.shown_s, 3)
         shown = {"playing": player.playing, "speed": player.speed, "behind": player.is_behind}
-        self._state.set(player=shown | {"position": position_s, "seconds": player.seconds})
+        self._controls.player = shown | {"position": position_s, "seconds": player.seconds}
         self._figures.position.location = position_s
         timeline, seconds = self._view.timeline, max(player.seconds, 1e-9)
         if timeline.is_read and self._state.changed("marks", timeline.is_complete):
@@ -151,7 +151,7 @@ class Page:
             bad = np.unique((np.concatenate([np.zeros(0), *bad_s]) / seconds).round(3)).tolist()
             shares = [time_s / seconds for time_s, _ in recorded.all()]
             counts = {"faults": timeline.faults, "events": recorded.count + len(recorded.largest_error)}
-            self._state.set(marks={"bad": bad, "incidents": shares} | counts)
+            self._controls.marks = {"bad": bad, "incidents": shares} | counts
 
     # Events ---------------------------------------------------------------------------------------------------
 

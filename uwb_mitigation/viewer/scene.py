@@ -28,19 +28,8 @@ from uwb_mitigation.types.anchors import MAX_ANCHORS, Anchor, AnchorMap
 from uwb_mitigation.types.measurement import Cir, Status
 from uwb_mitigation.types.ros.poses import tag_frame
 from uwb_mitigation.types.stamps import NS_PER_S
-from uwb_mitigation.viewer.histories import (
-    HISTORY_S,
-    MAX_RANGE_M,
-    MAX_SAMPLES,
-    BoundedDict,
-    History,
-    LeverArm,
-    Outages,
-    Pair,
-    Pose,
-    Sample,
-    Trail,
-)
+from uwb_mitigation.viewer import histories
+from uwb_mitigation.viewer.histories import HISTORY_S, MAX_RANGE_M, BoundedDict, History, Pair, Pose, Sample
 from uwb_mitigation.viewer.incidents import Incidents
 from uwb_mitigation.viewer.palette import TrackKind
 
@@ -142,14 +131,14 @@ class Scene:
         self.incidents = Incidents()
         # Stamps of different tags may come from different clocks.
         self.latest_stamps: BoundedDict[int | None, tuple[float, float]] = BoundedDict(MAX_PAIRS)
-        self._outages: BoundedDict[int | None, Outages] = BoundedDict(MAX_PAIRS)
+        self._outages: BoundedDict[int | None, histories.Outages] = BoundedDict(MAX_PAIRS)
         self.ranges = self.corrected = self.faults = self.uncertain = self.dropped = 0
         self.pairs: BoundedDict[Pair, History] = BoundedDict(math.inf if self.is_whole else MAX_PAIRS)
         self.tags: BoundedDict[str, Pose] = BoundedDict(MAX_TAGS)
-        self.lever_arms: BoundedDict[str, LeverArm] = BoundedDict(MAX_TAGS)
+        self.lever_arms: BoundedDict[str, histories.LeverArm] = BoundedDict(MAX_TAGS)
         # {tag: (filter of its raw ranges, stamp of the last pose whose height it got)}
         self._raw_locators: BoundedDict[int, tuple[TagEstimator, float]] = BoundedDict(MAX_TAGS)
-        self.tracks: BoundedDict[tuple[str, TrackKind], Trail] = BoundedDict(4 * MAX_TAGS)
+        self.tracks: BoundedDict[tuple[str, TrackKind], histories.Trail] = BoundedDict(4 * MAX_TAGS)
         self.reports: list[tuple[float, str, NodeStatus]] = []
         self.node_statuses: BoundedDict[str, NodeStatus] = BoundedDict(MAX_NODES)
         self.error_counts = np.zeros((2, len(ERROR_EDGES_M) - 1), np.int64)
@@ -192,8 +181,8 @@ class Scene:
         self.revision += 1
         return self.pairs.touch(pair, lambda: History(outages=self._outages_of(pair[1])))
 
-    def _outages_of(self, tag_id: int | None) -> Outages:
-        return self._outages.touch(tag_id, Outages)
+    def _outages_of(self, tag_id: int | None) -> histories.Outages:
+        return self._outages.touch(tag_id, histories.Outages)
 
     def add_sample(self, pair: Pair, sample: Sample) -> None:
         """Add a corrected range.
@@ -221,7 +210,7 @@ class Scene:
             history.add(sample, math.nan, self.received_s)
         else:
             residual_m = self._compare_with_position(pair, sample)
-            history.add(sample, residual_m, self.received_s, MAX_SAMPLES)
+            history.add(sample, residual_m, self.received_s, histories.MAX_SAMPLES)
             history.remove_before(tag_latest_s - HISTORY_S)
         if not math.isnan(sample.true_m):
             self.count_errors(np.array([[sample.raw_m], [sample.corrected_m]]) - sample.true_m)
@@ -264,7 +253,7 @@ class Scene:
             self.incidents.add_position(tag_label(name, None), pose.received_s, pose.x, pose.y)
         if not math.isfinite(pose.stamp_s):
             return
-        track = self.tracks.touch((name, kind), Trail)
+        track = self.tracks.touch((name, kind), histories.Trail)
         step_s, step_m = pose.stamp_s - track.last.stamp_s, math.dist(track.last[:2], pose[:2])
         if self.is_whole:
             track.append(pose)
@@ -275,20 +264,14 @@ class Scene:
 
     def set_track(self, tag: str, kind: TrackKind, poses: NDArray[np.float64] | Sequence[Pose]) -> None:
         """Replace a track by poses or their rows, float64 (k, 11)."""
-        self.tracks.add((tag[:MAX_TEXT], kind), Trail(np.reshape(poses, (-1, len(Pose._fields)))))
+        self.tracks.add((tag[:MAX_TEXT], kind), histories.Trail(np.reshape(poses, (-1, len(Pose._fields)))))
         self.revision += 1
 
     def show(self, recorded: Scene, now_s: float) -> None:
-        """Show the minute before a time of a recording, and its tracks until then; counts are those of all its ranges."""
+        """Show the minute before a time of a recording, and its tracks until then; only the recording has counts."""
         self.clear()
-        self.ranges, self.corrected = recorded.ranges, recorded.corrected
-        self.faults, self.uncertain = recorded.faults, recorded.uncertain
-        self.errors, self.error_counts = recorded.errors, recorded.error_counts
-        self.error_sums_m = recorded.error_sums_m
-        histories = [
-            (pair, history.until(now_s, now_s - HISTORY_S)) for pair, history in recorded.pairs.items()
-        ]
-        begun = [(pair, history) for pair, history in histories if len(history.rows)]
+        minutes = {pair: history.until(now_s, now_s - HISTORY_S) for pair, history in recorded.pairs.items()}
+        begun = [(pair, history) for pair, history in minutes.items() if len(history.rows)]
         for pair, history in sorted(begun, key=lambda item: item[1].last.received_s):
             self.pairs.add(pair, history)
             self.received_s = history.last.received_s

@@ -50,7 +50,7 @@ class Controls(DataModel):  # type: ignore[misc]
 
     Attributes:
         command: set by the script: name, arguments, and a number that makes it unique.
-        update: set by the server after each update: its number, how long the previous one took, and the time since the
+        timing: set by the server after each update: its number, how long the previous one took, and the time since the
             latest range was received, s; negative if there are no recent ranges.
         acknowledged: set by the script to the number of the last update that it has drawn.
         headline, verdict, notice, nodes, health, tag_rows, incidents, cards, player, selected, marks: set by the server.
@@ -59,7 +59,7 @@ class Controls(DataModel):  # type: ignore[misc]
     """
 
     command = AnyValue(default=None)
-    update = AnyValue(default=None)
+    timing = AnyValue(default=None)
     acknowledged = AnyValue(default=0)
     health = AnyValue(default=[])
     cards = AnyValue(default=[])
@@ -121,11 +121,6 @@ class PageState:
     def forget(self, name: str) -> None:
         """Let the next call of `changed` return True."""
         self._drawn.pop(name, None)
-
-    def set(self, **values: object) -> None:
-        """Set attributes of the controls; Bokeh sends those that have changed."""
-        for name, value in values.items():
-            setattr(self.controls, name, value)
 
 
 def new_source(*columns: str, **options: Any) -> ColumnDataSource:

@@ -88,7 +88,7 @@ class Texts:
         shown = verdicts[page.tag_id]
         tag = f" of tag {format_id(page.tag_id or 0)}" if len(verdicts) > 1 else ""
         reports = sorted((name, report.aged(scene.clock())) for name, report in scene.node_statuses.items())
-        page.set(
+        page.controls.update(
             headline=shown.headline(tag),
             verdict=[*shown[:3], *self._facts(scene, shown.accuracy)],
             health=_anchor_rows(anchors, states, names),

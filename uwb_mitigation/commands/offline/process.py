@@ -133,8 +133,7 @@ def process_bag(job: Job, report: Report | None = None) -> Outcome:
             batch: list[RawMessage] = []
             try:
                 # Not list(islice()): messages before the damage must be kept.
-                for message in islice(messages, BATCH):
-                    batch.append(message)  # noqa: PERF402
+                batch.extend(islice(messages, BATCH))
             except DamagedRecordingError as error:
                 outcome.error = error
             if not batch:

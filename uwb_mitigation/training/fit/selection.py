@@ -123,8 +123,3 @@ def select_nested(
             chosen = fallback
     (candidate,) = (item for item in candidates if item.name == chosen)
     return Selection(chosen, errors, candidate.fit(data, seed), folds, len(data.names))
-
-
-def min_configurations(folds: int) -> int:
-    """Return the minimum number of configurations for `select_nested`, so that no inner fold is empty."""
-    return 4 if folds == 2 else 3

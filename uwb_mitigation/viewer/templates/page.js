@@ -21,15 +21,15 @@ function start(doc) {
   // The next update comes after this one has been drawn: a slow page skips updates instead of showing old ones.
   let received = performance.now();
   const showAge = () => {
-    const player = controls.player, [, took, rangeAge] = controls.update ?? [0, 0, -1], age = (performance.now() - received) / 1000 + took;
+    const player = controls.player, [, took, rangeAge] = controls.timing ?? [0, 0, -1], age = (performance.now() - received) / 1000 + took;
     const late = player?.behind ? "Reading ..." : age > 2 && (player?.playing ?? true) ? `${age.toFixed(0)} s behind`
       : player?.playing && !position && rangeAge < 0 ? "NO RANGES" : "";
     $("age").className = late ? "late" : "";
     setText($("age"), late || (!player?.playing ? "PAUSED" : position ? "PLAYING" : `LIVE ${(age + rangeAge).toFixed(1)} s`));
   };
-  on("update", () => {
+  on("timing", () => {
     received = performance.now();
-    const [update] = controls.update;
+    const [update] = controls.timing;
     requestAnimationFrame(() => setTimeout(() => { controls.acknowledged = update; }));
   });
   setInterval(showAge, 200);
@@ -96,15 +96,6 @@ function start(doc) {
   // Map.
   const map = model("map");
   const fit = () => Bokeh.index.find_one(map).reset();
-  const pan = (x, y, zoom = 1) => {
-    const view = Bokeh.index.find_one(map);
-    const moved = ({start, end}, share) => {
-      const middle = (start + end) / 2 + share * (end - start), half = (end - start) / 2 * zoom;
-      return {start: middle - half, end: middle + half};
-    };
-    const xrs = new Map([[map.x_range, moved(map.x_range, x)]]), yrs = new Map([[map.y_range, moved(map.y_range, y)]]);
-    view.update_range({xrs, yrs}, {panning: zoom === 1, scrolling: zoom !== 1});
-  };
   // A name is on the first side where it covers no mark and no other name, else hidden: tags come first, then the selected anchor.
   const names = map.renderers.filter(({glyph}) => glyph.text), named = [...new Set(names.map((layer) => layer.data_source))].reverse();
   const placeNames = () => {
@@ -126,9 +117,9 @@ function start(doc) {
   setInterval(placeNames, 200);
   $("fit").addEventListener("click", fit);
   $("accuracy").addEventListener("change", (event) => send("accuracy", event.target.checked));
-  const keys = {ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1], "+": [0, 0, 0.8], "-": [0, 0, 1.25]};
   $("map").addEventListener("keydown", (event) => {
-    if (event.key === "0") fit(); else if (keys[event.key]) pan(...keys[event.key]); else return;
+    const tool = map.toolbar.tools.find(({name}) => name === event.key);
+    if (event.key === "0") fit(); else if (tool) tool.do.emit(); else return;
     event.preventDefault();
   });
   // A swipe over a figure scrolls the page of a touch screen: drag tools wait until they are chosen in the toolbar.
