@@ -131,7 +131,11 @@ ALL = [1, 2, 3, 4, 5]
     ("changes", "anchors", "expected"),
     [
         ({}, ALL, r"good: horizontal sd 0.\d\d m, 95 % within 0.\d\d m"),
-        ({2: 0.5}, ALL, r"degraded: Anchor 2 reads 0.\d\d m long. Check its position, or run `uwb-mitigation calibrate`"),
+        (
+            {2: 0.5},
+            ALL,
+            r"degraded: Anchor 2 reads 0.\d\d m long. Check its position, or run `uwb-mitigation calibrate`",
+        ),
         ({5: 0.5}, ALL, "good: .*"),
         ({1: 0.9, 4: -0.9}, ALL, "degraded: Anchor 1 .*: check height and lever arm of the tag, too"),
         (
