@@ -91,8 +91,7 @@ def test_ranges_yield_poses_odometry_smoothed_poses_and_markers(ros: Ros, anchor
         return values.get("ranges of unknown anchors") == "3" and "tag 7 HDOP" in values
 
     status = ros.diagnosis("locator", is_current)
-    moving = [pose for pose in poses if stamp_ns(pose) < run.start_ns + 18 * NANOSECONDS]
-    errors = run.errors(moving)
+    errors = run.errors([pose for pose in poses if stamp_ns(pose) < run.start_ns + 18 * NANOSECONDS])
     known = np.isfinite(errors)
     assert known.sum() > 500
     assert np.sqrt(np.mean(errors[known] ** 2)) < 0.3
@@ -131,7 +130,11 @@ ALL = [1, 2, 3, 4, 5]
     ("changes", "anchors", "expected"),
     [
         ({}, ALL, r"good: horizontal sd 0.\d\d m, 95 % within 0.\d\d m"),
-        ({2: 0.5}, ALL, r"degraded: Anchor 2 reads 0.\d\d m long. Check its position, or run `uwb-mitigation calibrate`"),
+        (
+            {2: 0.5},
+            ALL,
+            r"degraded: Anchor 2 reads 0.\d\d m long. Check its position, or run `uwb-mitigation calibrate`",
+        ),
         ({5: 0.5}, ALL, "good: .*"),
         ({1: 0.9, 4: -0.9}, ALL, "degraded: Anchor 1 .*: check height and lever arm of the tag, too"),
         (
