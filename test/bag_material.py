@@ -113,7 +113,6 @@ class Foreign:
 
     def truth(self, number: int, log_time_ns: int | None = None) -> None:
         known = record(number)
-        assert known.truth is not None
         data = codec.encode_truth(known.measurement, known.truth)
         self.add(topics.RANGE_TRUTH, log_time_ns or known.measurement.stamp_ns, data)
 

@@ -49,10 +49,9 @@ def write_bag(path: Path) -> Path:
 
 @pytest.mark.parametrize("name", ["bag.mcap", "folder"])
 def test_rosbags_opens_a_bag_and_agrees_on_every_field(tmp_path: Path, name: str) -> None:
-    path = write_bag(tmp_path / name)
     store = schemas.typestore()
     read = []
-    with Reader(path) as reader:
+    with Reader(write_bag(tmp_path / name)) as reader:
         for connection, stamp_ns, data in reader.messages():
             message = store.deserialize_cdr(data, connection.msgtype)
             number, stamp = message.sequence, message.header.stamp
@@ -209,9 +208,7 @@ corrections = st.builds(
 
 @settings(max_examples=50)
 @given(measurements, truths, corrections)
-def test_messages_equal_rosbags(
-    measurement: RangeMeasurement, truth: Truth, correction: CorrectedRange
-) -> None:
+def test_messages_equal_rosbags(measurement: RangeMeasurement, truth: Truth, correction: CorrectedRange):
     store = schemas.typestore()
     ours = (
         codec.encode_range(measurement),
@@ -231,9 +228,7 @@ def test_messages_equal_rosbags(
 
 
 @given(measurements, st.data())
-def test_batch_equals_single_messages_or_is_refused(
-    measurement: RangeMeasurement, data: st.DataObject
-) -> None:
+def test_batch_equals_single_messages_or_is_refused(measurement: RangeMeasurement, data: st.DataObject):
     count = len(measurement.cir.samples)
     samples = st.lists(st.integers(-9, 9), min_size=count, max_size=count).map(
         lambda x: np.array(x, np.int16)
@@ -276,9 +271,8 @@ def test_batch_equals_single_messages_or_is_refused(
 
 @given(measurements, st.integers(0, 3))
 def test_message_of_an_earlier_version_has_no_radio(measurement: RangeMeasurement, padding: int) -> None:
-    old = codec.encode_range(measurement)[:-2] + bytes(padding)
     expected = replace(measurement.cir, radio=RadioType.UNKNOWN, segment=Segment.UNKNOWN)
-    decoded = codec.decode_range(old)
+    decoded = codec.decode_range(codec.encode_range(measurement)[:-2] + bytes(padding))
     assert repr(decoded) == repr(replace(measurement, cir=expected))
 
 
@@ -293,9 +287,7 @@ def test_truncated_message_is_refused(measurement: RangeMeasurement, data: st.Da
 
 @pytest.mark.parametrize("decode", [codec.decode_range, codec.decode_truth, codec.decode_corrected])
 @given(noise=st.binary(max_size=200), start=st.sampled_from([b"", b"\0\1\0\0"]))
-def test_any_bytes_decode_or_are_refused(
-    decode: Callable[[bytes], object], noise: bytes, start: bytes
-) -> None:
+def test_any_bytes_decode_or_are_refused(decode: Callable[[bytes], object], noise: bytes, start: bytes):
     with contextlib.suppress(RecordingError):
         decode(start + noise)
 

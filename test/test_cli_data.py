@@ -42,8 +42,7 @@ def test_import_joins_recordings_and_keeps_the_simulated_mark(tmp_path: Path) ->
 
 
 def test_damaged_bag_is_shown_up_to_the_damage_and_exits_1(tmp_path: Path) -> None:
-    path = write_bag(tmp_path / "bag.mcap", 6)
-    end = damage_after_first_chunk(path)
+    end = damage_after_first_chunk(write_bag(tmp_path / "bag.mcap", 6))
     done = run("data", "info", "bag.mcap", "--json", "info.json", folder=tmp_path)
     assert done.returncode == 1
     assert "6 ranges" in done.stdout
@@ -77,9 +76,7 @@ def test_invalid_input_prints_one_line_and_exits_1(
 
 
 def messages(record: Record) -> tuple[bytes, bytes]:
-    assert record.truth is not None
-    measurement = record.measurement
-    return codec.encode_range(measurement), codec.encode_truth(measurement, record.truth)
+    return codec.encode_range(record.measurement), codec.encode_truth(record.measurement, record.truth)
 
 
 def test_all_apartment_logs_become_one_bag(

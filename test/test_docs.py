@@ -179,9 +179,7 @@ def test_parameters_set_on_pages_are_live(words: list[str]):
 
 
 @pytest.mark.parametrize("words", lines_of("ros2", "launch", "uwb_mitigation"))
-def test_launch_commands_start_nodes(
-    words: list[str], generate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_launch_commands_start_nodes(words: list[str], generate, tmp_path: Path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("robot.yaml", "left.yaml", "right.yaml"):
         Path(name).write_text("/**: {ros__parameters: {source: serial, port: /dev/ttyACM0}}")

@@ -58,9 +58,7 @@ def failed(checks: dict[str, dict]) -> set[str]:
     return {name for name, check in checks.items() if check["verdict"] == "fail"}
 
 
-def test_good_uci_boards_pass_and_the_file_names_nobody(
-    report: Report, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_good_uci_boards_pass_and_the_file_names_nobody(report: Report, tmp_path: Path, monkeypatch):
     with EmulatedUciBoards(links=tmp_path / "uci") as boards:
 
         def replug(_: str) -> None:
@@ -128,9 +126,7 @@ def test_board_without_cirs_has_no_check_of_them(report: Report, tmp_path: Path)
 
 
 @NEEDS_CC
-def test_only_the_low_supply_of_good_evb1000s_fails(
-    report: Report, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_only_the_low_supply_of_good_evb1000s_fails(report: Report, tmp_path: Path, monkeypatch):
     # On a busy machine, the emulated boards answer too late for the delays of real ones.
     monkeypatch.setattr(Evb1000Bus, "reply_us", 100_000)
     monkeypatch.setattr(Evb1000Bus, "timeout_us", 400_000)
@@ -148,9 +144,7 @@ def test_only_the_low_supply_of_good_evb1000s_fails(
         assert checks["read back: antenna delay (15.65 ps)"]["verdict"] == "pass"
 
 
-def test_negative_distances_are_named_with_their_cause(
-    report: Report, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_negative_distances_are_named_with_their_cause(report: Report, tmp_path: Path, monkeypatch):
     monkeypatch.setattr("uwb_mitigation.commands.field.test.START_TIMEOUT_S", 8.0)
     with EmulatedUciBoards(links=tmp_path / "uci", distance_m=0.2, faults=UciFaults(offset_m=-0.3)):
         check = report("uci")["failed exchanges: negative distance"]

@@ -54,9 +54,7 @@ def test_full_disk_keeps_the_old_file_and_leaves_no_partial_file(tmp_path: Path)
 
 @pytest.mark.parametrize("order", [1, -1])
 @pytest.mark.parametrize("unwritable", ["absent/file", "link"])
-def test_files_that_belong_together_are_written_atomically(
-    tmp_path: Path, unwritable: str, order: int
-) -> None:
+def test_files_that_belong_together_are_written_atomically(tmp_path: Path, unwritable: str, order: int):
     path, link = tmp_path / "file", tmp_path / "link"
     path.write_text("old")
     link.symlink_to(link)

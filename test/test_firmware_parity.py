@@ -81,8 +81,7 @@ ADDRESS_SANITIZED = ("-O1", "-fsanitize=address,undefined", "-fno-sanitize-recov
 
 def test_golden_vectors_pass_under_the_sanitizers_and_detect_a_changed_weight(tmp_path: Path):
     header = firmware_models.write_model(tmp_path, random_networks.remnet(64, 5))
-    program = build_program("golden", tmp_path, ADDRESS_SANITIZED)
-    assert "0 of 8 golden vectors wrong" in run_tool([program])
+    assert "0 of 8 golden vectors wrong" in run_tool([build_program("golden", tmp_path, ADDRESS_SANITIZED)])
     text = header.read_text()
     start = text.index("{\n", text.index("uwb_module1_residual_weights[")) + 2
     first = text[start : text.index(",", start)].strip()

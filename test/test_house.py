@@ -21,10 +21,9 @@ def test_layers_hold_and_only_nodes_import_rclpy_and_only_training_torch():
 
 def test_drawing_of_the_layers_agrees_with_the_contract_and_its_files_exist():
     page = (REPOSITORY / "docs" / "background" / "contributing.md").read_text(encoding="utf-8")
-    drawn = [sorted(line.split()) for line in re.findall(r"^[1-7] +(.*)$", page, re.M)]
     contract = re.search(r"^layers = \[\n(.*?)^\]", (REPOSITORY / "pyproject.toml").read_text(), re.M | re.S)
     layers = [sorted(re.findall(r"\w+", line)) for line in contract[1].splitlines()]
-    assert drawn == layers
+    assert [sorted(line.split()) for line in re.findall(r"^[1-7] +(.*)$", page, re.M)] == layers
     assert (len(layers), sum(map(len, layers))) == (7, 13)
     paths = re.findall(r"`((?:uwb_mitigation|firmware|docs|msg_defs)/[\w/.]+)`", page)
     assert len(paths) > 10

@@ -78,7 +78,6 @@ def test_executables_are_in_the_folder_of_ros2_run(prefix: Path):
 
 def test_command_is_in_the_path_of_a_sourced_workspace(prefix: Path):
     place = shutil.which("uwb-mitigation", path=f"{prefix / 'bin'}")
-    assert place is not None
     done = subprocess.run([place, "--version"], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
 

@@ -119,8 +119,6 @@ def test_solved_requantisation_equals_the_float_formula_on_every_accumulator(see
         np.float32(1), np.array([scale]), np.float32(1), np.array([low]), np.array([high])
     )[0]
     found = requantisation.solve_requantisation(moved, low, high)
-
-    assert found is not None
     accumulators = np.arange(low, high + 1)
     high_word = ((accumulators + found.bias) * found.multiplier) >> 32
     levels = np.clip((high_word + found.offset) >> requantisation.REQUANTISATION_SHIFT, 0, 255)

@@ -91,8 +91,7 @@ def test_ranges_yield_poses_odometry_smoothed_poses_and_markers(ros: Ros, anchor
         return values.get("ranges of unknown anchors") == "3" and "tag 7 HDOP" in values
 
     status = ros.diagnosis("locator", is_current)
-    moving = [pose for pose in poses if stamp_ns(pose) < run.start_ns + 18 * NANOSECONDS]
-    errors = run.errors(moving)
+    errors = run.errors([pose for pose in poses if stamp_ns(pose) < run.start_ns + 18 * NANOSECONDS])
     known = np.isfinite(errors)
     assert known.sum() > 500
     assert np.sqrt(np.mean(errors[known] ** 2)) < 0.3

@@ -134,9 +134,7 @@ def test_missing_topic_is_reported_with_the_existing_topics(tmp_path: Path) -> N
         ((topics.RANGE_RAW, topics.RANGE_CIR_TYPE, "float32 range"), "another version .* 'float32 range'"),
     ],
 )
-def test_topic_of_other_layout_is_refused(
-    tmp_path: Path, channel: tuple[str, str, str | None], excerpt: str
-) -> None:
+def test_topic_of_other_layout_is_refused(tmp_path: Path, channel: tuple[str, str, str | None], excerpt: str):
     bag = Foreign(tmp_path / "bag.mcap")
     bag.channel(*channel)
     bag.range(0)
@@ -176,10 +174,8 @@ def test_truncated_bag_yields_its_complete_messages_and_the_position_of_the_dama
         cut.write_bytes(complete[:size])
         read, error = prefix(cut)
         expected = max((count for end, count in ends.items() if end <= size), default=0)
-        assert read == list(range(len(read)))
-        assert len(read) == expected
+        assert read == list(range(expected))
         if size < max(ends):
-            assert error is not None
             assert str(cut) in str(error)
         if 8 <= size < max(ends):
             assert isinstance(error, DamagedRecordingError)

@@ -103,9 +103,8 @@ def test_correction_is_linear_bias_plus_network_in_float32(mitigation):
 @pytest.mark.parametrize("uncorrected_m2", [1 / 32, 0.5])
 def test_variance_of_a_range_without_cir_does_not_depend_on_the_offset(tmp_path, uncorrected_m2):
     saved = bundle(tmp_path, variance_uncorrected_m2=uncorrected_m2)
-    without = replace(measurement(**EMPTY), tag_id=7, anchor_id=1)
     for offsets in (Offsets(), Offsets(pairs={(7, 1): 0.2}, pair_sd={(7, 1): 0.03})):
-        result = Mitigation(saved, offsets).correct([without])[0]
+        result = Mitigation(saved, offsets).correct([replace(measurement(**EMPTY), tag_id=7, anchor_id=1)])[0]
         assert result.status is Status.NO_CIR
         assert result.variance_m2 == max(uncorrected_m2, UNRELIABLE_VARIANCE_M2)
 
@@ -295,8 +294,7 @@ def test_median_ends_with_the_first_range_that_moved():
 
 
 def test_failed_prediction_stays_failed_and_is_not_used():
-    values = np.insert(PREDICTED_M[:MIN_ALIKE], 3, np.nan)
-    result = smoothed(PairsAtRest(), values)
+    result = smoothed(PairsAtRest(), np.insert(PREDICTED_M[:MIN_ALIKE], 3, np.nan))
     assert np.isnan(result[3])
     assert result[-1] == np.sort(PREDICTED_M[:MIN_ALIKE])[MIN_ALIKE // 2]
 

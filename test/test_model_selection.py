@@ -69,8 +69,7 @@ def test_trained_network_must_show_its_gain_in_the_nested_error(monkeypatch):
 
     def select_simplest(errors, min_gain=0.02):
         """The inner folds prefer another candidate, so that the selection has a larger error."""
-        is_inner = len(next(iter(errors.values()))) < len(data)
-        return "half" if is_inner else prefer(errors, min_gain)
+        return "half" if len(next(iter(errors.values()))) < len(data) else prefer(errors, min_gain)
 
     monkeypatch.setattr(selection, "select_simplest", select_simplest)
     assert selection.select_nested(data, offered, 3, 0).chosen == "half"

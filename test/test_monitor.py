@@ -22,9 +22,7 @@ def printed(table: object, width: int = 100) -> str:
     return console.export_text()
 
 
-def corrected(
-    statistics: RangeStatistics, sequence: int, raw: float, out: float, latency_s: float = 0.001
-) -> None:
+def corrected(statistics: RangeStatistics, sequence: int, raw: float, out: float, latency_s: float = 0.001):
     result = CorrectedRange(out, raw, raw - out, 0.04, Status.OK, CorrectedBy.HOST, 1)
     key = MeasurementKey(sequence * 100_000_000, 1, 7, sequence)
     statistics.add_corrected(key, result, key.stamp_ns / 1e9 + latency_s)

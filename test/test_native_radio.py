@@ -109,9 +109,7 @@ def test_modem_manager_ignores_the_boards():
 
 @pytest.mark.parametrize("damage", [b"\x55", b"\x02", b"\x55" * 9])
 @pytest.mark.parametrize("position", [0, 3, 100])
-def test_stray_octets_in_an_answer_repeat_the_request(
-    damage: bytes, position: int, monkeypatch: pytest.MonkeyPatch
-):
+def test_stray_octets_in_an_answer_repeat_the_request(damage: bytes, position: int, monkeypatch):
     # No answer is too short; on a busy machine, one could be late.
     monkeypatch.setattr(evb1000, "ANSWER_TIMEOUT_S", 30.0)
     monkeypatch.setattr(evb1000, "REPEATED_TIMEOUT_S", 30.0)

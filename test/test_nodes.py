@@ -44,9 +44,8 @@ CORRECTED = "/uwb/range_corrected"
 @pytest.fixture(scope="session")
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a bag of 300 simulated ranges at 40 Hz."""
-    path = tmp_path_factory.mktemp("bag") / "simulated.mcap"
     source = SimulatedSource(seed=3, count=300, rate_hz=40.0)
-    return write_records(path, source, source=source.name)
+    return write_records(tmp_path_factory.mktemp("bag") / "simulated.mcap", source, source=source.name)
 
 
 def replay_through_both(ros: Ros, count: int, *driver: str) -> tuple[list[RangeCir], list[RangeCorrected]]:
@@ -106,8 +105,7 @@ def test_only_errors_of_ros_and_the_system_at_the_start_are_crashes_and_no_empty
         "    except SystemExit as end:\n"
         "        print(f'{step} fails, exit code {end.code}', file=sys.stderr)\n"
     )
-    record = f"record:={tmp_path}/live.mcap"
-    driver = ros.run([sys.executable, "-c", program, "--ros-args", "-p", record])
+    driver = ros.run([sys.executable, "-c", program, "--ros-args", "-p", f"record:={tmp_path}/live.mcap"])
     assert driver.wait() == 0
     assert re.findall(r"fails, exit code (\d+)", driver.output) == list(map(str, [CRASHED] * 3 + [REFUSED]))
     for step in ("__init__", "create_lifecycle_publisher", "prepare_encoders"):

@@ -34,8 +34,7 @@ def test_heading_follows_the_route_over_all_laps():
     yaw = yaw_along_route(ROUTE, at)
     # A turn by less than 180 degrees takes half a metre.
     assert np.abs(np.diff(yaw)).max() <= np.pi / 0.5 * 0.0101
-    on_first_leg = yaw_along_route(ROUTE, np.array([0.6]))
-    assert on_first_leg == pytest.approx(np.arctan2(0.1, 1.2))
+    assert yaw_along_route(ROUTE, np.array([0.6])) == pytest.approx(np.arctan2(0.1, 1.2))
     closed = np.array([*ROUTE, ROUTE[0]])
     lap = np.hypot(*np.diff(closed, axis=0).T).sum()
     turned = yaw_along_route(ROUTE, np.array([5.0, 5.0 + 3 * lap]))
@@ -54,17 +53,15 @@ def test_without_errors_the_odometry_is_the_true_path(monkeypatch: pytest.Monkey
 
 
 def test_odometry_has_a_scale_error_of_two_percent_drift_and_slip():
-    motions = [simulate_motion(ROUTE, SPEED_M_PER_S, SECONDS, seed) for seed in range(8)]
     ratios, slips, drifts, biases = [], [], [], []
-    for motion in motions:
+    for motion in [simulate_motion(ROUTE, SPEED_M_PER_S, SECONDS, seed) for seed in range(8)]:
         true = np.diff(motion.position, axis=0) * simulation.RATE_HZ
         fast = np.hypot(*true.T) > 0.45
         ratio = np.hypot(*motion.odometry.twist[1:, :2].T)[fast] / np.hypot(*true.T)[fast]
         ratios.append(abs(np.median(ratio) - 1.0))
         slips.append(np.mean(ratio > 1.25))
         drifts.append(motion.odometry.pose[-1, 2] - (motion.yaw[-1] - motion.yaw[0]))
-        yaw_rate = np.diff(motion.yaw) * simulation.RATE_HZ
-        biases.append(np.mean(motion.imu.yaw_rate[1:] - yaw_rate))
+        biases.append(np.mean(motion.imu.yaw_rate[1:] - np.diff(motion.yaw) * simulation.RATE_HZ))
     assert ratios == pytest.approx([0.02] * 8, abs=0.003)
     assert np.mean(slips) == pytest.approx(simulation.SLIP_S / simulation.SLIP_EVERY_S, rel=0.5)
     assert np.degrees(np.std(drifts)) > 20

@@ -73,8 +73,7 @@ def test_without_levels_los_is_detected_in_the_cir(direct: list[Record]):
     amplitude = Mitigation(load_bundle(default_model_path(Scaling.MAX)))
     found = estimate_offset(amplitude, without_levels(direct))
     assert found.offset_m == pytest.approx(0.22, abs=3.0 * found.sd_m)
-    reported = estimate_offset(amplitude, direct)
-    gaps = {one.placement: one.power_gap_db for one in reported.placements}
+    gaps = {one.placement: one.power_gap_db for one in estimate_offset(amplitude, direct).placements}
     for one in found.placements:
         assert one.power_gap_db == pytest.approx(gaps[one.placement], abs=1.0)
     with pytest.raises(DatasetError, match="not line of sight"):

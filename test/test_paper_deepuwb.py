@@ -180,8 +180,7 @@ def test_other_files_are_rejected_by_name(tmp_path: Path, content: bytes) -> Non
 
 def named(names: np.ndarray) -> Dataset:
     """Return a dataset whose measurements have these configurations."""
-    plain = dataset(1, len(names), samples=4)
-    return replace(plain, configurations=names)
+    return replace(dataset(1, len(names), samples=4), configurations=names)
 
 
 def test_split_of_deepuwb_has_the_published_sizes() -> None:

@@ -78,8 +78,7 @@ def test_pruned_weights_stay_zero_and_each_network_has_the_share():
     stack.fit(data, QUICK)
     removed = stack.fix_pruned()
     for seed in range(2):
-        weights = stack.weights_of(seed).weight
-        zeros = np.concatenate([weight.ravel() == 0 for weight in weights.values()])
+        zeros = np.concatenate([weight.ravel() == 0 for weight in stack.weights_of(seed).weight.values()])
         magnitudes = np.concatenate([np.abs(weight).ravel() for weight in before[seed].values()])
         assert zeros.sum() == removed == pytest.approx(len(zeros) / 2, abs=1)
         assert magnitudes[zeros].max() <= magnitudes[~zeros].min()

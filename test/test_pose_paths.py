@@ -83,8 +83,7 @@ def test_poses_are_read_from_every_supported_type(tmp_path, topic, make, frames)
 
 def test_published_covariance_contains_that_of_position_and_yaw():
     estimate = Estimate(0, np.ones(3), np.zeros(3), np.eye(6), Heading(0.5, np.array([0.1, 0.2, 0.3, 0.4])))
-    pose = STORE.deserialize_cdr(encode_pose(estimate), POSE_TYPE).pose
-    rows = pose.covariance.reshape(6, 6)
+    rows = STORE.deserialize_cdr(encode_pose(estimate), POSE_TYPE).pose.covariance.reshape(6, 6)
     assert rows[5].tolist() == rows[:, 5].tolist() == [0.1, 0.2, 0.3, 0.0, 0.0, 0.4]
 
 

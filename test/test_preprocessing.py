@@ -48,8 +48,7 @@ def apply(cir: Cir, samples: int = 157, scaling: Scaling = Scaling.PREAMBLE):
 @settings(max_examples=25)
 @given(data=st.data())
 def test_inputs_equal_the_specification_bit_by_bit(scaling, encoding, data):
-    seed = data.draw(st.integers(0, 2**32 - 1))
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(data.draw(st.integers(0, 2**32 - 1)))
     low = -32766 if encoding == Encoding.COMPLEX_INT16 else 0
     samples = generator.integers(low, 32767, 128).astype(np.int16)
     start_index = data.draw(st.integers(-2000, 2000))

@@ -70,8 +70,7 @@ def test_batches_equal_single_corrections_bit_by_bit(tmp_path: Path) -> None:
         replace(measured, stamp_ns=START_NS + number, frame_id="antenna")
         for number, measured in enumerate(measurements)
     ]
-    source = write_bag(tmp_path / "in.mcap", measurements)
-    outcome = process_bag(job(source, tmp_path / "out.mcap"))
+    outcome = process_bag(job(write_bag(tmp_path / "in.mcap", measurements), tmp_path / "out.mcap"))
     assert corrected_of(tmp_path / "out.mcap") == one_by_one(measurements)
     assert outcome.ranges == len(measurements) == outcome.statuses.total()
     assert set(outcome.statuses) >= {"OK", "NO_CIR", "BAD_CIR", "OUT_OF_DISTRIBUTION"}
@@ -101,10 +100,8 @@ def test_other_messages_and_those_that_do_not_decode_are_copied_byte_by_byte(tmp
 
 
 def test_corrected_ranges_of_the_input_are_replaced_and_counted(tmp_path: Path) -> None:
-    source = write_bag(tmp_path / "in.mcap", exchanges(30))
-    process_bag(job(source, tmp_path / "once.mcap"))
-    outcome = process_bag(job(tmp_path / "once.mcap", tmp_path / "twice.mcap"))
-    assert outcome.replaced == 30
+    process_bag(job(write_bag(tmp_path / "in.mcap", exchanges(30)), tmp_path / "once.mcap"))
+    assert process_bag(job(tmp_path / "once.mcap", tmp_path / "twice.mcap")).replaced == 30
     assert [m[1:] for m in BagReader(tmp_path / "once.mcap").messages()] == [
         m[1:] for m in BagReader(tmp_path / "twice.mcap").messages()
     ]
@@ -116,8 +113,7 @@ def test_ranges_of_a_radio_without_model_are_counted_with_their_reason(tmp_path:
     silent = replace(exchange(20), cir=replace(cir(20), samples=np.zeros_like(cir(20).samples)))
     write_bag(tmp_path / "in.mcap", [*exchanges(3), *measured, silent])
     words = "process in.mcap -o out.mcap --model evk1000_apartment --json out.json"
-    done = succeed(*words.split(), folder=tmp_path)
-    text = " ".join(done.stderr.split())
+    text = " ".join(succeed(*words.split(), folder=tmp_path).stderr.split())
     assert "12 ranges are not corrected: they are of DW3000 STS" in text
     assert "trained for DW1000 IPATOV" in text
     assert "1 ranges are not corrected: the window contains only zeros" in text
@@ -131,8 +127,7 @@ def test_offsets_of_a_file_are_subtracted_for_each_pair(tmp_path: Path) -> None:
     offsets = "default: 0.2\nanchors: {2: 0.35}\npairs: [{anchor: 3, tag: 7, offset: -0.1}]\n"
     (tmp_path / "offsets.yaml").write_text(offsets)
     words = "process in.mcap -o out.mcap --offsets offsets.yaml --model evk1000_apartment --json out.json"
-    done = succeed(*words.split(), folder=tmp_path)
-    assert "30 ranges" in done.stdout
+    assert "30 ranges" in succeed(*words.split(), folder=tmp_path).stdout
     result = json.loads((tmp_path / "out.json").read_text())
     assert (result["ranges"], result["messages"], result["failed"]) == (30, 60, 0)
     assert result["ranges_per_s"] > 0
@@ -161,8 +156,7 @@ def test_invalid_bag_is_reported_and_does_not_stop_the_others(tmp_path: Path) ->
     write_bag(folder / "later" / "b", exchanges(8))
     end = damage_after_first_chunk(write_bag(folder / "cut.mcap", exchanges(400)))
     (folder / "bad.mcap").write_bytes(b"nothing")
-    words = "process monday -o out --model evk1000_apartment --json out.json"
-    done = start(words, folder=tmp_path)
+    done = start("process monday -o out --model evk1000_apartment --json out.json", folder=tmp_path)
     assert done.returncode == 1
     for text in ("bad.mcap: not an MCAP file", f"cut.mcap, byte {end}", "2 of 4 bags failed"):
         assert text in done.stderr

@@ -171,9 +171,7 @@ def test_radio_without_cirs_is_located_live_as_from_raw_ranges():
         table.add_corrected(measurement_key(measurement), result)
         corrected = mixed.add(measurement, result)
         if expected is not None:
-            assert found is not None
             assert found.position.tolist() == expected.position.tolist()
-    assert corrected is not None
     assert corrected.position.tolist() != expected.position.tolist(), (
         "after a corrected range, its variance counts"
     )
@@ -208,6 +206,5 @@ def test_odometry_of_one_robot_is_not_used_for_several_tags(tmp_path: Path):
     config = EstimatorConfig(HALL, robot=RobotData())
     player = BagPlayer(bag, lambda: mitigation(TrackSettings()))
     player.index(config).join()
-    assert player.timeline is not None
     assert "--odometry with the tags 7, 8, 9" in player.timeline.notices[-1]
     assert not player.timeline.estimates

@@ -48,8 +48,7 @@ def test_killed_node_leaves_the_other_running_and_a_new_one_joins(ros: Ros):
 
 @pytest.mark.ros
 def test_ranges_dropped_by_a_queue_are_reported(ros: Ros):
-    measurement = next(iter(SimulatedSource(seed=2)))
-    data = encode_range(measurement.measurement)
+    data = encode_range(next(iter(SimulatedSource(seed=2))).measurement)
     ros.start("mitigator", "qos_overrides./uwb/range_raw.subscription.depth:=10").wait_for_output(
         "correcting"
     )
@@ -72,8 +71,7 @@ def test_model_is_swapped_live_without_losing_a_range_and_a_bad_one_is_refused(r
     torn = tmp_path / "torn.onnx"
     torn.write_bytes(default_model_path().read_bytes()[:-100])
     corrected = ros.collect(RangeCorrected, CORRECTED)
-    mitigator = ros.start("mitigator")
-    mitigator.wait_for_output("correcting with model")
+    ros.start("mitigator").wait_for_output("correcting with model")
     # The driver itself counts the mitigator.
     ros.wait_until_active("mitigator")
     ros.start("driver", "simulated_rate:=200.0", *PAUSED)

@@ -146,8 +146,7 @@ def stop_after(count: int) -> Callable[[Player, int], None]:
 
 def published_with(player: Player, sequence: int) -> int:
     """Return the number of records after the call with this one: late records are published together."""
-    ends = itertools.accumulate(player.batches)
-    return next(end for end in ends if end > player.sequences.index(sequence))
+    return next(end for end in itertools.accumulate(player.batches) if end > player.sequences.index(sequence))
 
 
 def test_stamps_keep_the_recorded_intervals_divided_by_the_rate_except_long_pauses():
@@ -248,8 +247,7 @@ def test_interruption_between_two_clock_readings_is_no_clock_step(monkeypatch: p
 def test_source_that_cannot_keep_its_rate_is_reported():
     source, clock = ListSource([each * 1000 for each in range(120)]), CountedTime()
     source.before = lambda index: clock.advance(5 * MS)
-    player = Player(source, replay_clock=clock).play()
-    _, level, text, values = player.feed.describe()
+    _, level, text, values = Player(source, replay_clock=clock).play().feed.describe()
     assert float(values["behind s"]) > 0.5
     assert level > b"\0"
     assert "simulated" in text

@@ -57,10 +57,9 @@ def test_lever_arm_is_rotated_by_the_heading():
     robot = Robot(lever=(0.5, 0.2, 0.3))
     distance, of_yaw, _ = robot.errors(RobotEstimator(robot.config).run(robot.ranges()), 12.0)
     wrong = replace(robot.config, robot=RobotData(robot.odometry, lever_arm=(-0.5, -0.2, 0.3)))
-    reversed_arm = robot.errors(RobotEstimator(wrong).run(robot.ranges()), 12.0)
     assert rms(of_yaw) < math.radians(3.0)
     assert rms(distance) < 0.2
-    assert rms(reversed_arm[1]) > 2.0 * rms(of_yaw)
+    assert rms(robot.errors(RobotEstimator(wrong).run(robot.ranges()), 12.0)[1]) > 2.0 * rms(of_yaw)
 
 
 def test_heading_of_a_stationary_robot_is_unknown():
@@ -227,7 +226,6 @@ def test_prediction_after_the_last_range_uses_the_motion():
     assert np.linalg.norm((ahead.position - true)[:2]) < np.linalg.norm((estimate.position - true)[:2])
     # Without odometry for longer, only the ranges-only estimate is left.
     late = estimator.predict_at(int(ranges.stamp_ns[-1]) + 2 * NANOSECONDS)
-    assert late is not None
     assert late.heading is None
 
 
@@ -277,9 +275,8 @@ def test_filter_starts_with_the_antenna_of_the_range_filter():
     start = RangeFilter(HALL, NoiseModel(), 0.0, np.array([5.0, 4.0, 1.0]), np.diag([0.04, 0.09, 0.01]))
     one = OdometryFilter(HALL, NoiseModel(), start, PathPoint(1), (0.4, -0.3, 0.2), (0.7, 0.2))
     np.testing.assert_allclose(one.antenna, start.position)
-    expected = start.estimate(0).covariance
     _, _, _, xx, xy, yy, *_ = one.published()
-    np.testing.assert_allclose((xx, xy, yy), expected[[0, 0, 1], [0, 1, 1]], atol=1e-12)
+    np.testing.assert_allclose((xx, xy, yy), start.estimate(0).covariance[[0, 0, 1], [0, 1, 1]], atol=1e-12)
 
 
 def _add_all(path: DeadReckoning, odometry: Odometry, *, poses: bool) -> None:
@@ -354,9 +351,8 @@ def test_invalid_odometry_is_rejected(twist):
 @pytest.mark.parametrize("poses", [True, False])
 def test_motion_backwards_in_time_returns_to_the_start(poses: bool):
     odometry = Robot(seconds=5.0).odometry
-    back = odometry.reversed(int(odometry.stamp_ns[-1]))
     path = DeadReckoning()
-    _add_all(path, back, poses=poses)
+    _add_all(path, odometry.reversed(int(odometry.stamp_ns[-1])), poses=poses)
     point = path.point_at(5 * NANOSECONDS)
     x, y, yaw = odometry.pose[0] - odometry.pose[-1]
     cosine, sine = math.cos(odometry.pose[-1, 2]), math.sin(odometry.pose[-1, 2])
@@ -416,8 +412,7 @@ def test_wrong_odometry_is_not_worse_than_ranges_only(fault: str):
     ranges = robot.ranges(seconds=90.0)
     alone = robot.errors(TagEstimator(replace(robot.config, robot=None)).run(ranges), 5.0)[0]
     wrong = replace(robot.config, robot=RobotData(odometry_faults(robot.odometry)[fault]))
-    mixed = robot.errors(RobotEstimator(wrong).run(ranges), 5.0)[0]
-    assert rms(mixed) <= 1.02 * rms(alone)
+    assert rms(robot.errors(RobotEstimator(wrong).run(ranges), 5.0)[0]) <= 1.02 * rms(alone)
 
 
 @pytest.mark.parametrize("fault", ["world axes", "sign of yaw rate"])
@@ -464,5 +459,4 @@ def test_scale_error_of_rotations_is_a_part_of_the_uncertainty_of_the_yaw():
     for stamp in range(20_000_000, 60 * NANOSECONDS, 20_000_000):
         path.add(stamp, None, (0.0, 0.0, 1.05))
         one.advance(stamp / NANOSECONDS, path.point_at(stamp))
-    error = one.yaw - 60.0
-    assert abs(error) < 2.0 * math.sqrt(one.yaw_variance)
+    assert abs(one.yaw - 60.0) < 2.0 * math.sqrt(one.yaw_variance)

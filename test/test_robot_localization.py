@@ -175,8 +175,7 @@ def locator_rmse(drives: list[Drive], name: str) -> float:
         true = np.column_stack([np.interp(track.stamp_ns, stamps, axis) for axis in position.T])
         error = (track.position[:, :2] - true)[..., None]
         squares.append(np.sum(error**2, axis=1).mean())
-        weighted = np.linalg.solve(track.covariance[:, :2, :2], error)
-        nees.append(np.sum(error * weighted, axis=1).mean() / 2.0)
+        nees.append(np.sum(error * np.linalg.solve(track.covariance[:, :2, :2], error), axis=1).mean() / 2.0)
     print(f"{name} of the locator: NEES/dof {np.mean(nees):.2f}", end=", ")
     print(f"position RMSE {np.sqrt(np.mean(squares)):.3f} m")
     return float(np.sqrt(np.mean(squares)))

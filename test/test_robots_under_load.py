@@ -81,8 +81,7 @@ class Nav2Manager:
 
 def raw_range(tag: int, sequence: int, range_m: float, time_ns: int = 0) -> RangeCir:
     """Return a range without a CIR: the mitigator subtracts exactly the offset."""
-    header = header_at(time_ns)
-    return RangeCir(header=header, tag_id=tag, anchor_id=1, sequence=sequence, range=range_m)
+    return RangeCir(header=header_at(time_ns), tag_id=tag, anchor_id=1, sequence=sequence, range=range_m)
 
 
 def test_nav2_takes_all_nodes_of_one_process_up_and_down_twice(ros: Ros, anchors: Path):
@@ -161,8 +160,7 @@ def test_a_simulated_clock_that_jumps_neither_stops_positions_nor_mixes_their_ti
         assert set(times_ns.tolist()) <= set(ranges.stamp_ns.tolist()), (
             "no position of a time that was not played"
         )
-        new = times_ns / NS
-        used = [pose for pose, second in zip(poses, new, strict=True) if 5 <= second < 10]
+        used = [pose for pose, second in zip(poses, times_ns / NS, strict=True) if 5 <= second < 10]
         places = np.array([(pose.pose.pose.position.x, pose.pose.pose.position.y) for pose in used])
         stamps = np.array([to_ns(pose.header.stamp) for pose in used])
         errors_m = np.hypot(*(places - truth.position_at(stamps - start_s * NS)[:, :2]).T)

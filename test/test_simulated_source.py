@@ -49,7 +49,6 @@ def test_truth_is_the_distance_between_anchor_and_robot() -> None:
     anchors = ((1.0, 1.0), (6.0, 5.0))
     for record in SimulatedSource(count=200, anchors=anchors):
         m, truth = record.measurement, record.truth
-        assert truth is not None
         place = along_route(ROUTE, np.array([0.5 * m.stamp_ns / 1e9]))[0]
         assert truth.range_m == pytest.approx(math.dist(place, anchors[m.anchor_id - 1]))
         assert m.tag_id == TAG_ID
@@ -88,9 +87,8 @@ def test_command_writes_a_bag_marked_as_simulated(tmp_path: Path, like: str) -> 
     assert done.exit_code == 0, done.output
     assert "simulated" in done.stdout
     result = json.loads((tmp_path / "sim.json").read_text())
-    lost = result["skipped"].get(NOT_RECEIVED, 0)
     assert result["simulated"]
-    assert result["ranges"] == ranges - lost
+    assert result["ranges"] == ranges - result["skipped"].get(NOT_RECEIVED, 0)
     read = McapRecording(tmp_path / "sim.mcap")
     assert read.simulated
     assert [record.measurement.cir.channel for record in read] == [5] * result["ranges"]
@@ -99,8 +97,7 @@ def test_command_writes_a_bag_marked_as_simulated(tmp_path: Path, like: str) -> 
     assert other.exit_code == 0, other.output
     wider = [record.measurement.cir.rx_power_dbm for record in McapRecording(tmp_path / "sim.mcap")]
     assert np.nanmean(wider) - np.nanmean(levels) > 0.5, "channel 5 is weaker than channel 2"
-    again = CliRunner().invoke(app, words)
-    assert "--force" in str(again.exception)
+    assert "--force" in str(CliRunner().invoke(app, words).exception)
 
 
 @pytest.mark.parametrize(
@@ -172,8 +169,7 @@ def test_nlos_delay_grows_with_the_distance() -> None:
         expected = 2.7 * np.minimum(distance[here] / 4.0, 3.0)
         assert here.sum() > 100
         assert np.mean(first[here] / expected) == pytest.approx(1.0, abs=4.0 / np.sqrt(here.sum()))
-    los = np.concatenate([block.pairs.fields[0].delay_ns[:, 0] for block in blocks])
-    assert (los == 0.0).all()
+    assert (np.concatenate([block.pairs.fields[0].delay_ns[:, 0] for block in blocks]) == 0.0).all()
 
 
 @pytest.fixture(scope="module")

@@ -74,8 +74,7 @@ def test_robot_stays_inside_the_flat_moves_steadily_and_drives_through_nothing()
     travelled = np.arange(0.0, 60.0, 0.05)
     position = scene.along_route(scene.ROUTE, travelled)
     assert ((position > 0) & (position < scene.FLAT.size)).all()
-    step = np.hypot(*np.diff(position, axis=0).T)
-    assert step.max() <= 0.05 + 1e-9
+    assert np.hypot(*np.diff(position, axis=0).T).max() <= 0.05 + 1e-9
     assert scene.FLAT.direct_path(position[:-1], position[1:]).crossings.max() == 0
 
 
@@ -91,8 +90,7 @@ def test_pulse_has_unit_energy_over_the_taps_and_no_sidelobes() -> None:
 @pytest.mark.parametrize("power_db", [-50.0, -65.0, -80.0])
 def test_single_pulse_is_detected_within_a_tenth_of_a_tap(power_db: float, number: int) -> None:
     radio = replace(QUIET, channel=CHANNELS[number])
-    error_m = radio.receive(lone_paths(400, power_db), rng()).error_m
-    assert np.abs(error_m).max() < 0.1 * TAP_NS * 0.299792458
+    assert np.abs(radio.receive(lone_paths(400, power_db), rng()).error_m).max() < 0.1 * TAP_NS * 0.299792458
 
 
 @pytest.mark.parametrize(("direct_db", "late"), [(-75.0, False), (-112.0, True)])

@@ -85,10 +85,9 @@ def test_unobservable_directions_are_reported():
 
 def test_recording_that_cannot_be_surveyed_is_refused(minute):
     still, _ = drive(seconds=10, path=lambda t: circuit(0 * t))
-    line = HALL.moved(HALL.position * (1, 0, 0), HALL.sd)
     for anchors, ranges, message in (
         (HALL, minute.take(minute.anchor < 2), "2 anchors were received"),
-        (line, minute, "on a line"),
+        (HALL.moved(HALL.position * (1, 0, 0), HALL.sd), minute, "on a line"),
         (HALL, still, "the tag moves by"),
     ):
         with pytest.raises(DatasetError, match=message):

@@ -101,8 +101,7 @@ def test_track_is_written_evaluated_and_read_by_evo(hall: Path, tmp_path: Path):
     live = live[1]
     off = live.position - truth[1].position_at(live.stamp_ns)
     assert np.nanmean(np.hypot(*off[:, :2].T)) < 0.2
-    evo = pytest.importorskip("evo.tools.file_interface")
-    read = evo.read_tum_trajectory_file(tum)
+    read = pytest.importorskip("evo.tools.file_interface").read_tum_trajectory_file(tum)
     assert read.num_poses >= 400
     np.testing.assert_allclose(read.timestamps[0], live.stamp_ns[0] / 1e9, atol=2.0)
 
@@ -144,12 +143,10 @@ def test_recording_that_cannot_be_tracked_is_refused(hall: Path, tmp_path: Path)
 def test_tag_without_a_position_does_not_stop_the_others(tmp_path: Path):
     bag = write_drive(tmp_path / "two.mcap", *drive(seconds=10), other_tag=8)
     arguments = ("track", bag, "-o", tmp_path / "track.mcap", "--tum", tmp_path / "track.tum")
-    done = succeed(*arguments, folder=tmp_path)
-    assert "tag 8: no position can be determined from 1 ranges" in done.stderr
+    assert "tag 8: no position can be determined from 1 ranges" in succeed(*arguments, folder=tmp_path).stderr
     assert [path.name for path in tmp_path.glob("*.tum")] == ["track.tag_7.tum"]
     (tmp_path / "track.mcap").unlink()
-    again = run(*arguments, folder=tmp_path)
-    assert "track.tag_7.tum: exists already" in again.stderr
+    assert "track.tag_7.tum: exists already" in run(*arguments, folder=tmp_path).stderr
 
 
 def test_survey_improves_the_anchor_positions(hall: Path, tmp_path: Path):
@@ -194,9 +191,7 @@ def robot_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return bag
 
 
-def test_odometry_adds_the_heading_to_tracks(
-    robot_bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_odometry_adds_the_heading_to_tracks(robot_bag: Path, tmp_path: Path, monkeypatch):
     results = []
     for number, options in enumerate(([], ["--odometry", "/odom"], ["--odometry", "/odom", "--imu", "/imu"])):
         out, report, tum = (tmp_path / f"{number}.{kind}" for kind in ("mcap", "json", "tum"))
@@ -270,8 +265,7 @@ def test_anchor_is_accused_only_if_another_position_explains_its_ranges():
     (less_certain,) = displaced(noisy, truth, HALL.moved(wrong, HALL.sd))
     assert less_certain.sd > 1.5 * fitted.sd
     assert displaced(ranges, truth) == []
-    longer = ranges.range_m + 0.8 * (ranges.anchor == 2)
-    assert displaced(replace(ranges, range_m=longer), truth) == []
+    assert displaced(replace(ranges, range_m=ranges.range_m + 0.8 * (ranges.anchor == 2)), truth) == []
     late = (ranges.anchor == 2) & (ranges.stamp_ns > 20 * NANOSECONDS)
     ranges.range_m[late] += np.random.default_rng(1).exponential(1.5, int(late.sum()))
     assert displaced(ranges, truth) == []
@@ -336,8 +330,7 @@ def test_real_run_is_read_and_imported_with_its_stamps_anchors_and_positions(han
     assert 0.7 < min(heights) < max(heights) < 1.7
     succeed("data", "import", hanyang / "LOS_A2", "-o", tmp_path / "a2.mcap", folder=tmp_path)
     assert [record.measurement.stamp_ns for record in open_recording(tmp_path / "a2.mcap")] == stamps
-    anchors = parse_anchors((tmp_path / "a2.anchors.yaml").read_text(), "a2")
-    assert anchors.anchors == source.anchors.anchors
+    assert parse_anchors((tmp_path / "a2.anchors.yaml").read_text(), "a2").anchors == source.anchors.anchors
 
 
 @pytest.mark.slow

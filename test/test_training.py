@@ -50,8 +50,7 @@ def test_configurations_have_equal_weight():
 def test_without_levels_the_bias_is_the_median_over_configurations():
     names = np.array(["a", "a", "b", "c"])
     unknown = np.full(4, np.nan)
-    linear_bias = fit_linear_bias(names, unknown, unknown, np.array([1.0, 2.0, 0.5, 9.0]))
-    assert linear_bias == LinearBiasModel(1.5)
+    assert fit_linear_bias(names, unknown, unknown, np.array([1.0, 2.0, 0.5, 9.0])) == LinearBiasModel(1.5)
 
 
 torch = pytest.importorskip("torch", reason="run `make setup-training`")
@@ -167,8 +166,7 @@ def test_bundle_loads_and_runs(tmp_path, shape, quantised):
     expected = (
         IntegerNetwork(integers).predict_m(inputs) if quantised else floating.predict_m(weights, inputs)
     )
-    computed = Session(bundle).predict_m(inputs)
-    assert np.allclose(computed, expected, atol=0 if quantised else 1e-5)
+    assert np.allclose(Session(bundle).predict_m(inputs), expected, atol=0 if quantised else 1e-5)
     if not quantised:
         read = graph.float_weights(bundle.model, shape)
         assert all(np.array_equal(weights.weight[name], read.weight[name]) for name in weights.weight)
@@ -182,10 +180,8 @@ def test_command_writes_both_bundles_with_the_error_by_condition(tmp_path: Path)
     assert made.card.preprocessing.scaling is Scaling.MAX
     assert made.card.source == "DW3000 STS"
     assert "experimental, no real recording was available" in made.card.origin
-    ood_bands = made.card.ood_bands
-    assert ood_bands is not None
-    assert not ood_bands.needs_levels
-    assert ood_bands.lead_level_db is not None
+    assert not made.card.ood_bands.needs_levels
+    assert made.card.ood_bands.lead_level_db is not None
     result = json.loads((tmp_path / "a.json").read_text())
     assert result["model_id"] == made.model_id
     assert result["simulated"]

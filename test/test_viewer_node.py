@@ -27,16 +27,13 @@ pytestmark = pytest.mark.ros
 def address(viewer: ros_harness.Process) -> str:
     """Return the URL of the page of a viewer that has started."""
     viewer.wait_for_output("the page is at")
-    found = re.search(r"the page is at (\S+)", viewer.output)
-    assert found is not None
-    return found[1]
+    return re.search(r"the page is at (\S+)", viewer.output)[1]
 
 
 def test_page_shows_published_messages_and_names_missing_nodes(ros: ros_harness.Ros, browser: Browser):
     published = ros.collect(RangeCorrected, "/uwb/range_corrected")
     anchors_out = ros.node.create_publisher(MarkerArray, "/uwb/anchors", endpoints.LATCHED)
-    viewer = ros.start("viewer", "port:=0")
-    url = address(viewer)
+    url = address(ros.start("viewer", "port:=0"))
     assert ros.node.count_subscribers("/uwb/range_raw") == 0, (
         "CIRs are not for the viewer while no page is open"
     )
@@ -105,8 +102,7 @@ def test_tag_topics_are_found_with_remapped_names(ros: ros_harness.Ros):
 
 def test_deactivated_viewer_unsubscribes_and_can_be_activated_again(ros: ros_harness.Ros):
     corrected = ros.node.create_publisher(RangeCorrected, "/uwb/range_corrected", 10)
-    viewer = ros.start("viewer", "port:=0")
-    url = address(viewer)
+    url = address(ros.start("viewer", "port:=0"))
     with PageClients(url, 1):
         ros.spin_until(lambda: ros.node.count_subscribers("/uwb/range_raw") == 1)
         assert ros.change_state("viewer", Transition.TRANSITION_DEACTIVATE)
@@ -122,9 +118,8 @@ def test_deactivated_viewer_unsubscribes_and_can_be_activated_again(ros: ros_har
 
 
 def test_rates_and_losses_are_correct_at_1000_ranges_per_second(ros: ros_harness.Ros, browser: Browser):
-    viewer = ros.start("viewer", "port:=0")
     publisher = ros.node.create_publisher(RangeCorrected, "/uwb/range_corrected", 10_000)
-    browser.open(address(viewer))
+    browser.open(address(ros.start("viewer", "port:=0")))
     browser.wait("the page", browser.ready)
     ros.spin_until(lambda: publisher.get_subscription_count() == 1)
     stop = threading.Event()

@@ -47,8 +47,7 @@ def view(clock: Clock) -> View:
         for anchor in (1, 2):
             magnitude = np.full(200, 10, np.int16)
             magnitude[20:40] = 1000 * anchor
-            cir = Cir(magnitude, Encoding.MAGNITUDE, 730, 750.4, noise_threshold=120)
-            scene.set_cir((anchor, 7), cir)
+            scene.set_cir((anchor, 7), Cir(magnitude, Encoding.MAGNITUDE, 730, 750.4, noise_threshold=120))
             status = Status.OK if anchor == 1 else Status.OUT_OF_DISTRIBUTION
             true_m, range_m = (5.1, 5.1) if anchor == 1 else (4.8, 5.3)
             scene.add_sample((anchor, 7), Sample(time_s, 5.3, range_m, 0.1, status, true_m))
@@ -160,9 +159,7 @@ def test_page_shows_how_old_it_is_and_can_be_paused_and_resumed(
     browser.wait("the age", lambda: "NO RANGES" in browser.text() and "LIVE" not in browser.text())
 
 
-def test_pair_is_selected_by_click_and_key_during_updates(
-    browser: Browser, view: View, server: ViewerServer
-) -> None:
+def test_pair_is_selected_by_click_and_key_during_updates(browser: Browser, view: View, server: ViewerServer):
     from selenium.webdriver.common.action_chains import ActionChains
 
     open_page(browser, server)
@@ -245,14 +242,9 @@ SCRIPT = "static/js/bokeh.min.js"
 def test_unknown_host_is_refused(view: View, server: ViewerServer) -> None:
     for own in ("localhost", "LocalHost", "127.0.0.1"):
         assert fetch(server, SCRIPT, Host=f"{own}:{server.port}").status == 200
+    names = "evil.example", f"evil.example:{server.port}", "localhost", f"localhost:{server.port + 1}"
     for path in ("", "ws", SCRIPT):
-        for name in (
-            "evil.example",
-            f"evil.example:{server.port}",
-            "localhost",
-            f"localhost:{server.port + 1}",
-        ):
-            assert fetch(server, path, Host=name).status == 403
+        assert [fetch(server, path, Host=name).status for name in names] == [403] * 4
     assert view.pages == 0
     with ViewerServer(view, port=0, origins=("robot.local:5006",)) as other:
         assert fetch(other, SCRIPT, Host="robot.local:5006").status == 200

@@ -174,8 +174,7 @@ def test_output_of_track_is_shown(tmp_path: Path):
     assert sorted(processed_scene.anchors) == sorted(HALL.index)
     player, scene = open_bag(track)
     player.seek(player.seconds)
-    kinds = {kind for _, kind in scene.tracks}
-    assert kinds >= {TrackKind.CORRECTED, TrackKind.SMOOTHED}
+    assert {kind for _, kind in scene.tracks} >= {TrackKind.CORRECTED, TrackKind.SMOOTHED}
     assert {name for name, kind in scene.tracks if kind is TrackKind.SMOOTHED} == set(scene.tags)
     assert any("0x1122334455667788" in name for name in scene.tags)
     for view in scene.tracks.values():
@@ -211,10 +210,9 @@ def test_truncated_bag_is_shown_up_to_the_damage(bag: Path, tmp_path: Path):
 
 def test_anchor_id_above_64_bits_is_ignored() -> None:
     scene = Scene()
-    feed = SceneUpdater(scene)
     pose = SimpleNamespace(position=SimpleNamespace(x=1.0, y=2.0, z=3.0))
     texts = "1" * 5000, str(2**64 - 1)
-    feed.markers(
+    SceneUpdater(scene).markers(
         SimpleNamespace(markers=[SimpleNamespace(ns="anchors", id=0, text=text, pose=pose) for text in texts])
     )
     assert list(scene.anchors) == [2**64 - 1]
@@ -329,8 +327,7 @@ def test_failed_correction_is_raised_and_shown(tmp_path: Path):
 
 @pytest.mark.parametrize("count", [1, 40])
 def test_tag_without_a_position_does_not_stop_the_player(tmp_path: Path, count: int):
-    path = corrected_bag(tmp_path / "one_anchor.mcap", range(0, 2 * count, 2))
-    player, scene = open_bag(path, HALL)
+    player, scene = open_bag(corrected_bag(tmp_path / "one_anchor.mcap", range(0, 2 * count, 2)), HALL)
     player.play(True)
     player.seek(player.seconds)
     assert latest(scene) == {(1, 7): 4.25 + 2 * count - 2}
@@ -350,7 +347,6 @@ def serve_recording(bag: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
         [*command, str(bag), "--port", "0"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
     try:
-        assert running.stdout is not None
         first_line = running.stdout.readline()
         found = re.search(r"http://\S+", first_line)
         assert found is not None, first_line + running.stdout.read()

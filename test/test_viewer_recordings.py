@@ -159,8 +159,7 @@ def test_anchor_that_is_not_where_the_file_says_is_named_first(bag: Path):
     assert states.pop("2") == health.BAD
     assert set(states.values()) == {health.UNKNOWN}, "their residuals are relative to a track that it bends"
     assert {row[4] for row in page.controls.health} == {"-"}
-    advice = {row[-1] for row in page.controls.health if row[1] != "2"}
-    assert advice == {"Not judged: see anchor 2."}
+    assert {row[-1] for row in page.controls.health if row[1] != "2"} == {"Not judged: see anchor 2."}
 
 
 def test_gaps_are_shown_as_gaps(tmp_path: Path):
@@ -262,8 +261,7 @@ def test_thinned_line_is_interrupted_only_by_gaps():
 
 
 def test_recording_without_cirs_has_no_bad_ranges_and_says_what_is_missing(tmp_path: Path):
-    path = corrected_bag(tmp_path / "radio.mcap", range(60), status=Status.NO_CIR)
-    page = Drawn(indexed(path))
+    page = Drawn(indexed(corrected_bag(tmp_path / "radio.mcap", range(60), status=Status.NO_CIR)))
     assert (page.controls.marks["bad"], page.controls.marks["faults"]) == ([], 0)
     page.send("seek", 1.0)
     assert page.controls.empty["cir"].startswith("No CIRs: the source sends none")

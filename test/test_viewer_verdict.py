@@ -273,8 +273,7 @@ def test_verdict_says_whether_the_ranges_of_this_tag_are_corrected_now():
 def test_correction_has_a_figure_only_if_ranges_were_corrected(status: Status):
     scene, clock = driven({1: 0.3}, status)
     for tenth in range(-30, 1):
-        place = Pose(4.1, 3.0, 0.0, stamp_s=clock.now_s + 900.0 + tenth / 10)
-        scene.add_pose("tag_7", place, TrackKind.TRUE)
+        scene.add_pose("tag_7", Pose(4.1, 3.0, 0.0, stamp_s=clock.now_s + 900.0 + tenth / 10), TrackKind.TRUE)
     assert ("Correction, last 60 s" in shown(scene).cards()) == (status is Status.OK)
 
 
@@ -485,8 +484,7 @@ def test_control_without_effect_is_disabled():
 
 
 def test_outermost_bins_are_labelled_as_such():
-    document = shown(driven()[0]).document
-    assert document.get_model_by_name("errors").xaxis[0].major_label_overrides == {
+    assert shown(driven()[0]).document.get_model_by_name("errors").xaxis[0].major_label_overrides == {
         -1: "-1 or less",
         2: "2 or more",
     }

@@ -122,8 +122,7 @@ def test_offset_without_cirs_prefers_labels_to_levels_and_needs_none(tmp_path: P
     assert {one.refused for one in found.placements} == {"", "not line of sight: labelled as NLOS"}
     assert found.offset_m == pytest.approx(-0.05, abs=0.05)
     write_records(tmp_path / "bare.mcap", records)
-    done = succeed("offset", "bare.mcap", "--truth", folder=tmp_path)
-    assert "nan" not in done.stdout
+    assert "nan" not in succeed("offset", "bare.mcap", "--truth", folder=tmp_path).stdout
     blocked = [record for record in records if record.truth is not None and record.truth.label == "NLOS"]
     with pytest.raises(DatasetError, match="labelled as NLOS"):
         estimate_offset(universal, blocked)
