@@ -374,7 +374,7 @@ def test_predicted_accuracy_is_shown_on_request():
     ("residuals_m", "nlos", "expected"),
     [
         ([0.0, 0.8, 0.0], [0.0, 94.0, 0.0], "Anchor 2 reads 0.80 m long, with 94 % NLOS: its line of sight"),
-        ([0.0, -0.4, 0.0], [0.0, 0.0, 0.0], "Anchor 2 reads 0.40 m short: calibrate"),
+        ([0.0, -0.4, 0.0], [0.0, 0.0, 0.0], "Anchor 2 reads 0.40 m short: check its position"),
         ([0.2, 0.8, 0.3], [0.0, 94.0, 0.0], "All anchors read too long, 0.30 m in the median: a common cause"),
         ([0.2, -0.8, 0.3], [0.0, 0.0, 0.0], "The ranges of all anchors contradict the position: check ids"),
         ([0.2, 0.8, 0.3], [90.0, 94.0, 60.0], "The ranges of all anchors contradict the position, and most are NLOS"),
