@@ -107,8 +107,9 @@ def test_command_writes_a_bag_marked_as_simulated(tmp_path: Path, like: str) -> 
         ({"seed": 1.5}, ("seed", "1.5", "whole number")),
         ({"count": -5}, ("count", "-5", "0 to")),
         ({"rate_hz": math.nan}, ("rate_hz", "nan", "0.1 to 100000")),
-        ({"anchors": ()}, ("0 anchors", "1 to 256")),
-        ({"anchors": ((math.nan, 0.0),)}, ("anchors", "a position is not finite")),
+        ({"anchors": ()}, ("anchors", "()", "pairs of finite")),
+        ({"anchors": ((math.nan, 0.0),)}, ("anchors", "nan", "pairs of finite")),
+        ({"route": ((0.0, 0.0), (1.0, 1.0))}, ("route", "2", "3 to 10000")),
     ],
 )
 def test_invalid_parameter_is_refused(options: dict, excerpts: tuple[str, ...]) -> None:

@@ -16,7 +16,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.errors import check_range
+from uwb_mitigation.errors import ParameterError, check_range
 from uwb_mitigation.simulation.antenna_pairs import AntennaPairs, Environments, draw_fields, label
 from uwb_mitigation.simulation.buildings import PLACEMENTS, RESIDENTIAL, Block, block_of
 from uwb_mitigation.simulation.buildings import RADIO as BUILDINGS_RADIO
@@ -155,6 +155,8 @@ class SimulatedSource(Simulated):
     ) -> None:
         check_seed(seed)
         check_range("simulated source", "count", count, 0, 2**40, whole=True)
+        _check_positions("anchors", anchors, 1, 64)
+        _check_positions("route", route, 3, 10_000)
         super().__init__(f"simulated flat, seed {seed}", rate_hz, radio or Receiver(), count)
         self._plan = plan
         self._seed = seed
@@ -281,6 +283,16 @@ def _cir(reception: Reception, i: int, radio: Receiver) -> Cir:
         radio=radio.kind,
         segment=radio.segment,
     )
+
+
+def _check_positions(name: str, points: tuple[Point, ...], low: int, high: int) -> None:
+    try:
+        array = np.asarray(points, np.float64)
+    except (TypeError, ValueError):
+        array = np.empty(0)
+    if array.ndim != 2 or array.shape[1] != 2 or not np.isfinite(array).all():
+        raise ParameterError(f"{name} = {points!r}", where="simulated source", valid="pairs of finite x, y")
+    check_range("simulated source", f"number of {name}", len(array), low, high)
 
 
 def check_seed(seed: int) -> None:
