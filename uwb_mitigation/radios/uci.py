@@ -107,7 +107,12 @@ class UciPort(port.StreamPort):
         self._originals.close()
 
     def apply(self, settings: UciPortSettings) -> None:
-        """Start the board again with other settings."""
+        """Start the board again with other settings.
+
+        Raises:
+            ParameterError: the settings are invalid.
+        """
+        settings.board.check()
         with self._lock:
             if settings.board != self.session.settings:
                 self.session.ranging.settings = settings.board

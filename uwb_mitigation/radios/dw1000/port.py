@@ -67,7 +67,7 @@ class ChipPort(RadioPort):
     Events are measurements, `RadioStatus` once a second, and `PortMessage`.
 
     Args:
-        settings: what the radio does, and where; see `read_chips`.
+        settings: what the radio does, and where.
         open_bus: opens the bus; called again after it was lost.
         on_event: see `RadioPort`.
         stamp_clock: clock for stamps, ns.
@@ -77,6 +77,7 @@ class ChipPort(RadioPort):
         status: state and counts.
 
     Raises:
+        ParameterError: the settings are invalid.
         MissingDependencyError: no C compiler is installed.
     """
 
@@ -88,6 +89,7 @@ class ChipPort(RadioPort):
         stamp_clock: Callable[[], int],
     ) -> None:
         super().__init__(settings.port, on_event, ExchangeMonitor(RadioStatus.REMEDIES))
+        settings.radio.check()
         load_native()
         self.settings: RadioSettings | None = None
         self.status = RadioStatus(state=RadioState.BUS)
@@ -99,7 +101,12 @@ class ChipPort(RadioPort):
         self._status_due_s = self._sensors_due_s = 0.0
 
     def apply(self, settings: ChipSettings) -> None:
-        """Use other settings of the radio, starting with the next exchange."""
+        """Use other settings of the radio, starting with the next exchange.
+
+        Raises:
+            ParameterError: the settings are invalid.
+        """
+        settings.radio.check()
         self._requested_settings = settings.radio
 
     def report(self) -> PortReport:

@@ -211,7 +211,12 @@ class BoardSession(Session):
         self._next_request_ns = 0
 
     def set_radio(self, settings: RadioSettings) -> None:
-        """Request `settings` now and after each start of the board; a `RadioConfigured` or `Refused` follows."""
+        """Request `settings` now and after each start of the board; a `RadioConfigured` or `Refused` follows.
+
+        Raises:
+            ParameterError: no radio has such settings.
+        """
+        settings.check()
         self._radio_request.begin(settings)
         self._next_request_ns = 0
 
