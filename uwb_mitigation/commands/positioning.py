@@ -105,7 +105,7 @@ def track(
     for failure in failures:
         warn(f"{failure}.")
     if force or not anchors_path(output).exists():
-        save_anchors(anchors_path(output), config.anchors, f"anchors of the track of {bag.name}")
+        save_anchors(anchors_path(output), config.anchors, f"anchors of the track of {bag.name}", force=True)
     _show_tracks(tracks)
     residuals = tracking.held_out(tracks, config)
     _show_residuals(residuals, config.anchors)
@@ -168,7 +168,9 @@ def survey(
     tag = max(recorded.tags, key=lambda recording: len(recording.ranges))
     with console.step_bar(f"surveying from {len(tag.ranges)} ranges of tag {format_id(tag.tag_id)}"):
         result = survey_anchors(config, tag.ranges, off_m=off, fixed=frozenset(rows))
-    save_anchors(output, result.anchors, f"surveyed from {bag.name}, tag {format_id(tag.tag_id)}")
+    save_anchors(
+        output, result.anchors, f"surveyed from {bag.name}, tag {format_id(tag.tag_id)}", force=force
+    )
     _show_survey(result, has_fixed=len(rows) > 1)
     print_line(f"Wrote {len(index)} anchors to {output}.")
     console.write_json(json, {"output": output}, result)

@@ -301,7 +301,7 @@ class MultiTagEstimator:
             if range_filter is not None:
                 values |= {
                     f"{name} overcorrection": f"{min(range_filter.state.overcorrection, 0.0):.2f}",
-                    f"{name} persisting errors m": f"{math.sqrt(range_filter.state.persisting_variance()):.2f}",
+                    f"{name} persisting errors m": f"{math.sqrt(range_filter.state.persisting_variance(len(estimator.received_anchors()), estimator.dims)):.2f}",
                     f"{name} variance factor": f"{estimator.raw_factor:.1f}",
                 }
             if tag.robot is not None:

@@ -203,10 +203,12 @@ def load_anchors(path: Path | str) -> AnchorMap:
     return parse_anchors(read_bounded(path, MAX_TEXT, ParameterError, SCHEMA), str(path))
 
 
-def save_anchors(path: Path, anchors: AnchorMap, comment: str = "") -> None:
-    """Write an anchors file atomically, also over an existing one.
+def save_anchors(path: Path, anchors: AnchorMap, comment: str = "", *, force: bool = False) -> None:
+    """Write an anchors file atomically.
 
     Raises:
-        ParameterError: it cannot be written.
+        ParameterError: it exists and `force` is not given, or it cannot be written.
     """
+    if path.exists() and not force:
+        raise ParameterError("exists already", where=path, valid="--force replaces it")
     write_atomically(path, dump_anchors(anchors, comment), ParameterError)

@@ -33,10 +33,10 @@ image is used if the sum over the anchors is smaller by `EVIDENCE`."""
 RANGE_ERROR_M = 0.17
 """Ranges of positions are compared with this standard deviation at least: also errors persist, and obstacles."""
 
-CAUTION = 2.0
+CAUTION = 1.5
 """Factor of the variance of persisting errors in published covariances. This, `COVARIANCE_SCALE` and the constants of `residual_square`
 were chosen on 139 development runs (drives past random anchors with constant errors of up to 0.3 m, layouts of real deployments, simulated
-sites with raw and corrected ranges, Hanyang): 95 % ellipses contain less than 85 % of the positions in 2 of 51 drives past random anchors."""
+sites with raw and corrected ranges, Hanyang): 95 % ellipses contain less than 85 % of the positions in 2 of 53 drives past random anchors."""
 
 LEVEL = 0.9
 """A mirror with a larger vertical component of its normal reflects heights."""
@@ -141,14 +141,15 @@ class AmbiguityCheck:
             return
         position, anchors, state = filter_.position, self._position[rows], filter_.state
         gain = constant_error_gain(anchors, position, dims, self._model.offset_sd)
-        variance = state.persisting_variance()
+        variance = state.persisting_variance(len(rows), dims)
         filter_.unseen = np.zeros((6, 6))
         unseen = filter_.unseen[:3, :3]
         unseen[:] = self._widens * (CAUTION * variance + state.constant_variance(rows)) * gain
         sd_m = math.sqrt(max(variance, RANGE_ERROR_M**2))
         self.error_sd_m = sd_m
         offset_sd_m = math.sqrt(float(state.P[OFFSET, OFFSET]))
-        covariance = COVARIANCE_SCALE * state.P[:3, :3] + variance * gain
+        excess = max(state.residual_square - RANGE_ERROR_M**2, 0.0)
+        covariance = COVARIANCE_SCALE * state.P[:3, :3] + excess * gain
         key = dims, *rows
         if key not in self._symmetries:
             symmetry = Symmetry.of(anchors, dims, RANGE_ERROR_M)

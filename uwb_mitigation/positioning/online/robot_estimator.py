@@ -24,7 +24,7 @@ from uwb_mitigation.positioning.online.heading_test import KNOWN_YAW_SD, Heading
 from uwb_mitigation.positioning.online.initialization import IMPLAUSIBLE
 from uwb_mitigation.positioning.online.measurements import TagHeight, TagRange
 from uwb_mitigation.positioning.online.odometry_filter import OdometryFilter
-from uwb_mitigation.positioning.online.robust_update import COVARIANCE_SCALE, items_of
+from uwb_mitigation.positioning.online.robust_update import items_of
 from uwb_mitigation.positioning.online.tag_estimator import TagEstimator, run_estimator
 from uwb_mitigation.types.tracks import Estimate, Heading, Ranges, Track, rows_of
 
@@ -244,7 +244,7 @@ class RobotEstimator:
             return
         if self._test.is_due(time_s, point):
             state = tag.filter.state
-            variance = 0.5 * (state.P_items[0, 0] + state.P_items[1, 1]) * COVARIANCE_SCALE
+            variance = 0.5 * (state.P_items[0, 0] + state.P_items[1, 1]) * state.covariance_scale()
             self._test.add(time_s, complex(*state.x_items[:2]), variance, point)
         if self._heading_filter is not None:
             self._update_separation(self._heading_filter, dt)
@@ -259,7 +259,8 @@ class RobotEstimator:
         if dt > 0.0:
             self._separation += min(dt / SEPARATION_S, 1.0) * (separation - self._separation)
             self._rejections *= math.exp(-dt / FORGIVEN_S)
-        scale = COVARIANCE_SCALE
+        # Large range errors move the ranges-only solution away from correct odometry, too.
+        scale = max(state.covariance_scale(), 1.0)
         self._is_apart = separation > APART * scale
         if self._separation < VERIFIED_SEPARATION * scale:
             self._is_rejected = False

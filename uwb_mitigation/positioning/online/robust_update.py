@@ -48,7 +48,7 @@ MAX_CONSTANT = 16
 """With more anchors, the one whose constant error has been estimated for longest is forgotten: the state remains small."""
 
 MAX_RATIO = 9.0
-"""Limit of the contribution of a range to `raw_ratio`: a single anchor with a large error must not dominate it."""
+"""Limit of the contribution of a range to `consistency`: a single anchor with a large error must not dominate it."""
 
 LARGE_RATIO = 2.0
 """Raw ranges whose persisting errors have a larger mean second moment relative to the model get a larger variance, until it is this
@@ -61,12 +61,18 @@ RATIO_RATE = 0.001
 COVARIANCE_SCALE = 1.5
 """Factor of P in published covariances."""
 
+CONSISTENCY_RATE = 0.01
+"""Share of a new range in the running mean `consistency`: it includes about a hundred ranges."""
+
+SCALE, POWER, MIN_SCALE, MAX_SCALE = 2.2, 4.0, 0.2, 12.0
+"""See `RobustUpdate.covariance_scale`."""
+
 RESIDUAL_SCALE = 1.75
-"""Variance of persisting errors relative to the mean square of residuals: a fit of a position and an offset to seven anchors hides three
-sevenths of it. Published covariances contain twice as much, see `ambiguity.CAUTION`."""
+"""Least variance of persisting errors relative to the mean square of residuals: a fit of a position and an offset to seven anchors hides
+three sevenths of it. With fewer anchors it hides more."""
 
 RESIDUAL_RATE, SHORTEST_RESIDUAL_M, LONGEST_RESIDUAL_M = 0.012, -1.5, 0.5
-"""Share of a new range in `residual_square`, and limits of the residuals: longer ones are obstacles, which the robust loss excludes."""
+"""Share of a new range in `residual_square`, and limits of the residuals: longer ones are obstacles, whose weight is small."""
 
 MIN_UNIT, MAX_ELAPSED = 1e-3, 100.0
 """Limits of `RobustUpdate.error_unit`, and of the time constants of one prediction."""
@@ -95,9 +101,9 @@ class RobustUpdate:
         H: float64 (n,), derivatives of the next range with respect to the motion states, which the owner sets.
         x_items, P_items, H_items: the same as memory views, whose elements are Python numbers: faster than those of arrays.
         estimates_errors: whether measurements change offset and errors, which are only considered otherwise.
+        consistency: running mean of the second moments of the persisting errors, relative to the model; 1: they are as modelled.
         raw_factor: of the variance of raw ranges; the owner sets it.
-        raw_ratio: running mean of the second moments of the persisting errors of raw ranges, relative to the model without the factor of
-            `LARGE_RATIO`; 1: they are as modelled.
+        raw_ratio: `consistency` of raw ranges over a thousand ranges, relative to the model without the factor of `LARGE_RATIO`.
         overcorrection: mean error of uncertain corrected ranges in their standard deviations; if negative, it is subtracted.
         residual_square: running mean of the products of two residuals of an anchor in a row, m^2: of their errors without noise.
     """
@@ -109,7 +115,8 @@ class RobustUpdate:
         self._error_variance: list[float] = ((1.0 - model.white) * model.range_sd**2 + anchors.sd**2).tolist()
         # The inverse square of the unit at each anchor's latest range.
         self.error_unit, self._noise_until = 1.0, [1.0] * len(anchors)
-        self.estimates_errors, self.raw_ratio, self.raw_factor = False, 1.0, 1.0
+        self.estimates_errors, self.consistency, self.raw_ratio = False, 1.0, 1.0
+        self.raw_factor = 1.0
         self.residual_square, self._last_residual = 0.0, [0.0] * len(anchors)
         self.overcorrection, self._num_uncertain = 0.0, MIN_UNCERTAIN
         self._constant_rows: dict[int, int] = {}
@@ -277,8 +284,11 @@ class RobustUpdate:
         square = residual * self._last_residual[anchor]
         self._last_residual[anchor] = residual
         self.residual_square += RESIDUAL_RATE * (square - self.residual_square)
+        ratio = (x[row] ** 2 + P[row, row]) / (noise_until * error_variance)
+        if ratio > MAX_RATIO:
+            ratio = MAX_RATIO
+        self.consistency += CONSISTENCY_RATE * (ratio - self.consistency)
         if not is_corrected:
-            ratio = min((x[row] ** 2 + P[row, row]) / (noise_until * error_variance), MAX_RATIO)
             self.raw_ratio += RATIO_RATE * (factor * ratio - self.raw_ratio)
         return z, sd
 
@@ -322,6 +332,16 @@ class RobustUpdate:
         is_raw = [self._is_raw[row] for row in rows if row in self._is_raw] or [True]
         return CONSTANT_SD**2 * (sum(is_raw) / len(is_raw))
 
-    def persisting_variance(self) -> float:
-        """Return the variance of the errors that do not average out, m^2."""
-        return RESIDUAL_SCALE * max(self.residual_square, 0.0)
+    def persisting_variance(self, num_anchors: int, dims: int) -> float:
+        """Return the variance of the errors that do not average out, m^2, for the number of received anchors and unknown coordinates."""
+        hidden = num_anchors / max(num_anchors - dims - 1, 1)
+        return max(hidden, RESIDUAL_SCALE) * max(self.residual_square, 0.0)
+
+    def covariance_scale(self) -> float:
+        """Return the factor with which solutions of filters are compared: a larger one if the estimated errors are large now.
+
+        The filter sees only a part of the persisting errors, so that their true variance differs from the model by more than
+        `consistency`. The power and the limits were chosen on simulated drives, the Hanyang runs and the labyrinth.
+        """
+        scale = SCALE * math.pow(self.consistency, POWER)
+        return scale if MIN_SCALE < scale < MAX_SCALE else min(max(scale, MIN_SCALE), MAX_SCALE)

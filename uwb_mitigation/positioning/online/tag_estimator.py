@@ -24,6 +24,7 @@ from uwb_mitigation.positioning.online.initialization import (
     candidate_positions,
 )
 from uwb_mitigation.positioning.online.measurements import TagHeight, TagRange
+from uwb_mitigation.positioning.online.robust_update import COVARIANCE_SCALE
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Estimate, Heights, Ranges, Track, rows_of
 
@@ -299,6 +300,9 @@ class TagEstimator:
             received, was_ambiguous = self.received_anchors(), self.is_ambiguous
             self._is_short = sum(self._states[row].short_square > TOO_SHORT for row in received) > 1
             filter_.factor = CONTRADICTED_FACTOR if self.is_contradicted else 1.0
+            if not self.config.widens:
+                # The smoother compares filters in both directions.
+                filter_.factor *= filter_.state.covariance_scale() / COVARIANCE_SCALE
             self._adapt_variance([self._states[row].mean_z for row in received])
             filter_.state.raw_factor = self.raw_factor
             if self._detect_loss(received):
