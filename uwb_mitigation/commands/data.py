@@ -281,7 +281,7 @@ def _save_anchors(source: Source, bag: Path) -> None:
     if anchors := getattr(source, "anchors", None):
         path = anchors_path(bag)
         # An existing bag was already refused, unless `--force` is given.
-        save_anchors(path, anchors, f"anchors of {source.name}")
+        save_anchors(path, anchors, f"anchors of {source.name}", force=True)
         print_line(f"Wrote {len(anchors)} anchors to {path}.")
 
 

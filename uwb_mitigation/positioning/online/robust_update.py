@@ -58,7 +58,7 @@ development seeds of the layout `box`; the RMSE of 26 drives in other layouts, s
 RATIO_RATE = 0.001
 """Share of a new range in the running mean `raw_ratio`: it includes about a thousand ranges."""
 
-COVARIANCE_SCALE = 1.5
+COVARIANCE_SCALE = 1.4
 """Factor of P in published covariances."""
 
 CONSISTENCY_RATE = 0.01
