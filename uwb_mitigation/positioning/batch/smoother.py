@@ -276,7 +276,11 @@ def smooth(config: EstimatorConfig, ranges: Ranges, live: Track) -> Track:
     # Constant errors of ranges, and mirrored heights, are the same in both directions: they are no reason to prefer one.
     alone = replace(config, widens=False)
     earlier = _states_at(make_estimator(alone).run(ranges), stamp_ns)
-    unseen = np.nan_to_num(_states_at(live, stamp_ns)[1] - earlier[1])
+    # The part of the position's covariance beyond that of the filter, which can be larger at times.
+    unseen = np.zeros_like(earlier[1])
+    beyond = np.nan_to_num(_states_at(live, stamp_ns)[1] - earlier[1])[:, :3, :3]
+    values, vectors = np.linalg.eigh(beyond)
+    unseen[:, :3, :3] = (vectors * np.maximum(values, 0.0)[:, None, :]) @ vectors.transpose(0, 2, 1)
     track = make_estimator(replace(alone, heights=heights, robot=robot)).run(ranges.reversed(end_ns))
     later = _states_at(track, (end_ns - stamp_ns)[backwards])
     flip = np.diag([1.0, 1.0, 1.0, -1.0, -1.0, -1.0])
