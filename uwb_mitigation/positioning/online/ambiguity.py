@@ -144,7 +144,9 @@ class AmbiguityCheck:
         variance = state.persisting_variance(len(rows), dims)
         filter_.unseen = np.zeros((6, 6))
         unseen = filter_.unseen[:3, :3]
-        unseen[:] = self._widens * (CAUTION * variance + state.constant_variance(rows)) * gain
+        # P contains the modelled errors.
+        constant = max(CAUTION * variance - state.modelled_variance, state.constant_variance(rows))
+        unseen[:] = self._widens * constant * gain
         sd_m = math.sqrt(max(variance, RANGE_ERROR_M**2))
         self.error_sd_m = sd_m
         offset_sd_m = math.sqrt(float(state.P[OFFSET, OFFSET]))

@@ -327,6 +327,11 @@ class RobustUpdate:
             K[self._offset :] = 0.0
         self.x -= K * (self.x[axis] - value)
 
+    @property
+    def modelled_variance(self) -> float:
+        """Mean variance of the persisting errors in the model, m^2."""
+        return sum(self._error_variance) / len(self._error_variance)
+
     def constant_variance(self, rows: Sequence[int]) -> float:
         """Return the variance of constant errors that are not states, m^2: those of the received `rows` whose latest range was raw."""
         is_raw = [self._is_raw[row] for row in rows if row in self._is_raw] or [True]
