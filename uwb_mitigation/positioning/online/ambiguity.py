@@ -36,7 +36,7 @@ RANGE_ERROR_M = 0.17
 CAUTION = 1.5
 """Factor of the variance of persisting errors in published covariances. This, `COVARIANCE_SCALE` and the constants of `residual_square`
 were chosen on 139 development runs (drives past random anchors with constant errors of up to 0.3 m, layouts of real deployments, simulated
-sites with raw and corrected ranges, Hanyang): 95 % ellipses contain less than 85 % of the positions in 2 of 53 drives past random anchors."""
+sites with raw and corrected ranges, Hanyang): 95 % ellipses contain less than 85 % of the positions in three of them."""
 
 LEVEL = 0.9
 """A mirror with a larger vertical component of its normal reflects heights."""
